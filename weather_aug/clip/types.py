@@ -133,6 +133,8 @@ class Frame:
     """(H, W) train ids, or None where nobody labelled the frame."""
     depth_m: NDArray[Any] | None = None
     """(H, W) float16 or float32 z-depth in metres, `inf` for the sky; None where unknown."""
+    normals_world: NDArray[np.float32] | None = None
+    """(H, W, 3) unit surface normals in world axes, zero where there is no surface; or None."""
     boxes: tuple[Box, ...] = ()
 
     def __post_init__(self) -> None:

@@ -1,0 +1,369 @@
+"""Weather: the physical state of the air and the ground, and one severity scale for all of it."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+from weather_aug._checks import finite, real
+from weather_aug.errors import ArgumentError, printable
+
+CONTRAST_THRESHOLD = 0.05
+"""Contrast left at the meteorological optical range (World Meteorological Organization)."""
+
+NAMED_SEVERITIES = {"light": 0.25, "moderate": 0.5, "heavy": 0.75, "extreme": 1.0}
+
+Wind = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Weather:
+    """The physical state of air and ground; the default is clear air over a dry road.
+
+    Build one with `rain`, `snow`, `fog` or `clear`; every field can be overridden in its unit.
+
+    Convention:
+        A Weather is a value: frozen, hashable, comparable, and the same in every clip. What falls
+        and what lies on the ground are separate fields: a wet road without rain is a Weather, and
+        so is snowfall over a clear road. Wind is given along the street, not in world axes: (along
+        the clip's first heading, to its left, up). Severity s in [0, 1] names a physical state, it
+        is not part of it: light 0.25, moderate 0.5, heavy 0.75, extreme 1; between the stops all
+        quantities are log-linear in s, below light they fall to 0 with s squared (fog extinction:
+        with s), so that s = 0 is clear.
+
+    Raises:
+        ArgumentError: If a field is outside its range.
+
+    Source:
+        Rates inside the classes of the American Meteorological Society and the Met Office;
+        fog stops at the three levels of Foggy Cityscapes; see docs/design.md.
+    """
+
+    rain_mm_per_h: float = 0.0
+    """Rain rate, in [0, 400]."""
+    snow_mm_per_h: float = 0.0
+    """Snowfall as liquid water, in [0, 50]."""
+    visibility_m: float = math.inf
+    """Meteorological optical range in the fog at camera height, in [1, inf]; inf is no fog."""
+    fog_scale_height_m: float = math.inf
+    """Height over which the fog thins by a factor e, in [1, inf]; inf is fog without a top."""
+    mist_per_km: float = 0.0
+    """Extinction of what comes with precipitation (mist, blowing snow), in [0, 100] per km."""
+    wetness: float = 0.0
+    """Of the ground, in [0, 1]."""
+    snow_cover: float = 0.0
+    """Of the ground beside the road, in [0, 1]."""
+    overcast: float = 0.0
+    """From the recorded sky (0) to a closed cloud deck (1)."""
+    wind_m_per_s: Wind = (0.0, 0.0, 0.0)
+    """(along the first heading, to its left, up), each in [-60, 60]."""
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in _RANGES.items():
+            value = real(name, getattr(self, name))
+            if not low <= value <= high:
+                raise ArgumentError(f"{name} must be in [{low:g}, {high:g}], got {value!r}")
+            object.__setattr__(self, name, value)
+        try:
+            along, left, up = self.wind_m_per_s
+        except (TypeError, ValueError):
+            raise ArgumentError("wind_m_per_s must be three numbers (along, left, up)") from None
+        wind = tuple(finite("wind_m_per_s", v, -60, 60) for v in (along, left, up))
+        object.__setattr__(self, "wind_m_per_s", wind)
+
+    @classmethod
+    def clear(cls) -> Weather:
+        """Clear air over a dry road: rendering it gives the recorded picture back, bit by bit."""
+        return cls()
+
+    @classmethod
+    def rain(
+        cls,
+        severity: float | str | None = None,
+        *,
+        mm_per_h: float | None = None,
+        falling: bool = True,
+        **overrides: Any,
+    ) -> Weather:
+        """Rain, with the mist, wetness, overcast sky and wind that come with it.
+
+        Args:
+            severity: In [0, 1] or a name (light, moderate, heavy, extreme).
+            mm_per_h: The rate instead of a severity; what comes with it follows the rate.
+            falling: False for the time after: wet ground and overcast sky, nothing in the air.
+            **overrides: Fields of Weather in their units.
+        """
+        s = _severity(severity, "mm_per_h", mm_per_h, rain_severity)
+        state = {
+            "rain_mm_per_h": _RAIN.at(s) if mm_per_h is None else mm_per_h,
+            "mist_per_km": _RAIN_MIST.at(s),
+            "wetness": _WETNESS.at(s),
+            "overcast": _RAIN_OVERCAST.at(s),
+            "wind_m_per_s": (0.0, _RAIN_WIND.at(s), 0.0),
+        }
+        if not falling:
+            state |= {"rain_mm_per_h": 0.0, "mist_per_km": 0.0}
+        return _build(cls, state, overrides)
+
+    @classmethod
+    def snow(
+        cls,
+        severity: float | str | None = None,
+        *,
+        mm_per_h: float | None = None,
+        falling: bool = True,
+        **overrides: Any,
+    ) -> Weather:
+        """Snowfall, with the blowing snow, ground cover, overcast sky and wind that come with it.
+
+        Args:
+            severity: In [0, 1] or a name (light, moderate, heavy, extreme).
+            mm_per_h: The liquid-equivalent rate instead of a severity.
+            falling: False for snow on the ground under clear air.
+            **overrides: Fields of Weather in their units.
+        """
+        s = _severity(severity, "mm_per_h", mm_per_h, snow_severity)
+        state = {
+            "snow_mm_per_h": _SNOW.at(s) if mm_per_h is None else mm_per_h,
+            "mist_per_km": _BLOWING_SNOW.at(s),
+            "snow_cover": _SNOW_COVER.at(s),
+            "overcast": _SNOW_OVERCAST.at(s),
+            "wind_m_per_s": (0.0, _SNOW_WIND.at(s), 0.0),
+        }
+        if not falling:
+            state |= {"snow_mm_per_h": 0.0, "mist_per_km": 0.0}
+        return _build(cls, state, overrides)
+
+    @classmethod
+    def fog(
+        cls,
+        severity: float | str | None = None,
+        *,
+        visibility_m: float | None = None,
+        **overrides: Any,
+    ) -> Weather:
+        """Fog of a meteorological optical range, under the sky that comes with it.
+
+        Args:
+            severity: In [0, 1] or a name (light, moderate, heavy, extreme).
+            visibility_m: Distance at which contrast falls to 5 %, metres, instead of a severity.
+            **overrides: Fields of Weather in their units.
+        """
+        s = _severity(severity, "visibility_m", visibility_m, fog_severity)
+        inverse_height = _fog_inverse_height(s)
+        state = {
+            "visibility_m": visibility_from_severity(s) if visibility_m is None else visibility_m,
+            "fog_scale_height_m": 1.0 / inverse_height if inverse_height else math.inf,
+            "overcast": _FOG_OVERCAST.at(s),
+            "wind_m_per_s": (0.0, _FOG_WIND.at(s), 0.0),
+        }
+        return _build(cls, state, overrides)
+
+    @staticmethod
+    def blend(a: Weather, b: Weather, t: float) -> Weather:
+        """The transition from `a` (t = 0) to `b` (t = 1); rates and extinctions run linearly."""
+        t = finite("t", t, 0, 1)
+        if t in (0.0, 1.0):
+            return b if t else a
+        return _combine(a, b, lambda x, y: x + (y - x) * t)
+
+    @staticmethod
+    def mix(a: Weather, b: Weather) -> Weather:
+        """Both at once: rates and extinctions add, the ground takes both, the stronger wind blows.
+
+        Fog of different heights becomes one layer whose inverse scale height is the mean of the
+        two, weighted by their extinctions.
+        """
+        both = _combine(a, b, lambda x, y: x + y)
+        beta_a, beta_b = a.fog_per_m, b.fog_per_m
+        inverse = (beta_a / a.fog_scale_height_m + beta_b / b.fog_scale_height_m) / (
+            beta_a + beta_b or 1.0
+        )
+        return replace(
+            both,
+            fog_scale_height_m=1.0 / inverse if inverse else math.inf,
+            wetness=1 - (1 - a.wetness) * (1 - b.wetness),
+            snow_cover=1 - (1 - a.snow_cover) * (1 - b.snow_cover),
+            overcast=max(a.overcast, b.overcast),
+            wind_m_per_s=max(a.wind_m_per_s, b.wind_m_per_s, key=lambda wind: math.hypot(*wind)),
+        )
+
+    @property
+    def fog_per_m(self) -> float:
+        """Extinction of the fog at camera height, 1/m; -ln(0.05) over the visibility."""
+        return -math.log(CONTRAST_THRESHOLD) / self.visibility_m
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether nothing of this weather can be seen (wind alone cannot)."""
+        return replace(self, wind_m_per_s=(0.0, 0.0, 0.0), fog_scale_height_m=math.inf) == Weather()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Fields as JSON values; infinity is None."""
+        state = asdict(self) | {"wind_m_per_s": list(self.wind_m_per_s)}
+        return {k: None if v == math.inf else v for k, v in state.items()}
+
+    @classmethod
+    def from_dict(cls, state: dict[str, Any]) -> Weather:
+        """The inverse of `to_dict`; unknown fields are refused."""
+        if not isinstance(state, dict):
+            raise ArgumentError(f"a Weather is read from an object, got {type(state).__name__}")
+        values = {
+            k: math.inf if v is None and k in ("visibility_m", "fog_scale_height_m") else v
+            for k, v in state.items()
+        }
+        return _build(cls, {}, values)
+
+    def to_json(self) -> str:
+        """One line of JSON that `from_json` reads back to an equal Weather."""
+        return json.dumps(self.to_dict(), allow_nan=False)
+
+    @classmethod
+    def from_json(cls, text: str) -> Weather:
+        """Read what `to_json` wrote.
+
+        Raises:
+            ArgumentError: If the text is not a JSON object of Weather's fields.
+        """
+        try:
+            state = json.loads(text)
+        except ValueError as error:
+            raise ArgumentError(f"not a Weather in JSON: {error}") from None
+        return cls.from_dict(state)
+
+
+_RANGES = {
+    "rain_mm_per_h": (0.0, 400.0),
+    "snow_mm_per_h": (0.0, 50.0),
+    "visibility_m": (1.0, math.inf),
+    "fog_scale_height_m": (1.0, math.inf),
+    "mist_per_km": (0.0, 100.0),
+    "wetness": (0.0, 1.0),
+    "snow_cover": (0.0, 1.0),
+    "overcast": (0.0, 1.0),
+}
+
+
+@dataclass(frozen=True)
+class _Stops:
+    """A quantity at light, moderate, heavy and extreme, and the power it falls with below light."""
+
+    values: tuple[float, float, float, float]
+    power_below: int = 2
+
+    def at(self, s: float) -> float:
+        if s <= 0.25:
+            return self.values[0] * (4 * s) ** self.power_below
+        lower = min(int(4 * s) - 1, 2)
+        a, b = self.values[lower], self.values[lower + 1]
+        return a * (b / a) ** (4 * s - 1 - lower)
+
+    def severity_of(self, value: float) -> float:
+        """The inverse of `at`, cut at 1; needs strictly rising stops."""
+        if value <= self.values[0]:
+            return 0.25 * (value / self.values[0]) ** (1 / self.power_below)
+        for lower in range(3):
+            a, b = self.values[lower], self.values[lower + 1]
+            if value <= b:
+                return (1 + lower + math.log(value / a) / math.log(b / a)) / 4
+        return 1.0
+
+
+_RAIN = _Stops((1.5, 5.0, 20.0, 75.0))
+_RAIN_MIST = _Stops((0.2, 0.6, 2.0, 5.0))
+_WETNESS = _Stops((0.5, 0.8, 1.0, 1.0))
+_RAIN_OVERCAST = _Stops((0.6, 0.8, 1.0, 1.0))
+_RAIN_WIND = _Stops((1.5, 3.0, 6.0, 10.0))
+_SNOW = _Stops((0.4, 1.0, 2.0, 4.0))
+_BLOWING_SNOW = _Stops((0.3, 0.8, 2.0, 5.0))
+_SNOW_COVER = _Stops((0.25, 0.6, 0.9, 1.0))
+_SNOW_OVERCAST = _Stops((0.6, 0.8, 1.0, 1.0))
+_SNOW_WIND = _Stops((0.5, 1.0, 2.0, 4.0))
+_FOG = _Stops((0.005, 0.01, 0.02, 0.06), power_below=1)
+_FOG_OVERCAST = _Stops((0.6, 0.8, 1.0, 1.0))
+_FOG_WIND = _Stops((0.5, 0.5, 0.5, 0.5))
+_FOG_INVERSE_HEIGHT = (0.0, 0.0, 1 / 60, 1 / 25)
+
+
+def rain_severity(mm_per_h: float) -> float:
+    """Severity in [0, 1] of a rain rate; the inverse of `Weather.rain` up to extreme."""
+    return _RAIN.severity_of(finite("mm_per_h", mm_per_h, *_RANGES["rain_mm_per_h"]))
+
+
+def snow_severity(mm_per_h: float) -> float:
+    """Severity in [0, 1] of a liquid-equivalent snow rate."""
+    return _SNOW.severity_of(finite("mm_per_h", mm_per_h, *_RANGES["snow_mm_per_h"]))
+
+
+def fog_severity(visibility_m: float) -> float:
+    """Severity in [0, 1] of a meteorological optical range in metres."""
+    visibility_m = real("visibility_m", visibility_m)
+    if visibility_m < _RANGES["visibility_m"][0]:
+        raise ArgumentError(f"visibility_m must be at least 1 m, got {visibility_m!r}")
+    return _FOG.severity_of(-math.log(CONTRAST_THRESHOLD) / visibility_m)
+
+
+def visibility_from_severity(s: float) -> float:
+    """Meteorological optical range in metres of a fog severity in [0, 1]."""
+    beta_per_m = _FOG.at(s)
+    return -math.log(CONTRAST_THRESHOLD) / beta_per_m if beta_per_m else math.inf
+
+
+def parse_severity(severity: float | str) -> float:
+    """A severity in [0, 1] from a number or one of its names.
+
+    Raises:
+        ArgumentError: If it is neither.
+    """
+    if isinstance(severity, str):
+        if severity not in NAMED_SEVERITIES:
+            raise ArgumentError(
+                f"severity {printable(severity)!r} is not one of {', '.join(NAMED_SEVERITIES)}, "
+                "nor a number in [0, 1]"
+            )
+        return NAMED_SEVERITIES[severity]
+    return finite("severity", severity, 0, 1)
+
+
+def _severity(severity: float | str | None, unit: str, value: float | None, inverse: Any) -> float:
+    if (severity is None) == (value is None):
+        raise ArgumentError(f"give either a severity or {unit}")
+    return float(inverse(value)) if severity is None else parse_severity(severity)
+
+
+def _fog_inverse_height(s: float) -> float:
+    """1/m; linear between the stops, because it is 0 at the light ones."""
+    position = max(4 * s - 1, 0.0)
+    lower = min(int(position), 2)
+    a, b = _FOG_INVERSE_HEIGHT[lower], _FOG_INVERSE_HEIGHT[lower + 1]
+    return a + (b - a) * (position - lower)
+
+
+def _build(cls: type[Weather], state: dict[str, Any], overrides: dict[str, Any]) -> Weather:
+    known = {f.name for f in fields(cls)}
+    unknown = sorted(set(overrides) - known)
+    if unknown:
+        raise ArgumentError(
+            f"Weather has no field {printable(unknown[0])}; its fields are "
+            f"{', '.join(f.name for f in fields(cls))}"
+        )
+    return cls(**(state | overrides))
+
+
+def _combine(a: Weather, b: Weather, op: Any) -> Weather:
+    """Combine field by field; ranges and heights through their inverses, which are additive."""
+    state: dict[str, Any] = {}
+    for name, (low, high) in _RANGES.items():
+        x, y = getattr(a, name), getattr(b, name)
+        if high == math.inf:
+            inverse = op(1 / x, 1 / y)
+            state[name] = max(1 / inverse, low) if inverse else math.inf
+        else:
+            state[name] = min(max(op(x, y), low), high)
+    state["wind_m_per_s"] = tuple(
+        min(max(op(x, y), -60.0), 60.0)
+        for x, y in zip(a.wind_m_per_s, b.wind_m_per_s, strict=True)
+    )
+    return Weather(**state)

@@ -363,7 +363,6 @@ def _combine(a: Weather, b: Weather, op: Any) -> Weather:
         else:
             state[name] = min(max(op(x, y), low), high)
     state["wind_m_per_s"] = tuple(
-        min(max(op(x, y), -60.0), 60.0)
-        for x, y in zip(a.wind_m_per_s, b.wind_m_per_s, strict=True)
+        min(max(op(x, y), -60.0), 60.0) for x, y in zip(a.wind_m_per_s, b.wind_m_per_s, strict=True)
     )
     return Weather(**state)

@@ -1,0 +1,337 @@
+"""A frame and a weather become a picture with honest labels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weather_aug._checks import finite
+from weather_aug._keys import check_seed
+from weather_aug.clip.types import Camera, Frame
+from weather_aug.errors import ArgumentError
+from weather_aug.particles import statistics
+from weather_aug.particles.field import MAX_PARTICLES, ParticleField, Window
+from weather_aug.particles.resolve import DEPTH_BINS, FAR_M, Resolved
+from weather_aug.render import kernels
+from weather_aug.render.label import NEIGHBOURHOOD_PX, readable_labels
+from weather_aug.render.light import (
+    LUMINANCE,
+    Ambience,
+    encode_table,
+    rain_colour,
+    snow_colour,
+    tone,
+)
+from weather_aug.taxonomy import SKY
+from weather_aug.weather import Weather
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+
+ZENITH_GAIN = 0.6
+"""How much brighter an overcast sky is overhead than at the horizon, less than the CIE's 2, because
+the camera exposes for the street and clips."""
+FALLOFF_STEPS = 2048
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """How much work to spend on a frame."""
+
+    max_particles: int = 30_000
+    """Expected number of resolved particles in a whole picture; the rest becomes extinction."""
+
+    def __post_init__(self) -> None:
+        finite("max_particles", self.max_particles, 0, MAX_PARTICLES // 2)
+
+
+DEFAULT_OPTIONS = RenderOptions()
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedFrame:
+    """A picture in weather, and what can still be said about it; H, W are the window's size."""
+
+    image: UInt8
+    """(H, W, 3) sRGB."""
+    label: UInt8 | None
+    """(H, W) train ids, 255 where the surface cannot be seen; None where nobody labelled it."""
+    label_full: UInt8 | None
+    """(H, W) train ids of the clear frame."""
+    invalid: UInt8
+    """(H, W), 1 where the surface is undetectable or beyond the optical range."""
+    transmittance: Float32
+    """(H, W) share of the surface's light that reaches the pixel, in [0, 1]."""
+    depth: Float32
+    """(H, W) z-depth of the surface, metres, `inf` for the sky."""
+
+
+def render(
+    frame: Frame,
+    weather: Weather,
+    *,
+    seed: int,
+    ambience: Ambience,
+    window: Window | None = None,
+    options: RenderOptions = DEFAULT_OPTIONS,
+) -> RenderedFrame:
+    """Render `frame` in `weather`: a pure function of its arguments.
+
+    Args:
+        frame: Picture with depth; a label decides where the sky is, else the depth does.
+        weather: State of air and ground.
+        seed: Which particles fall; equal seeds show equal particles at any severity.
+        ambience: Light and axes of the scene.
+        window: (top, left, height, width) to render, the whole picture if None; a window's pixels
+            equal the same pixels of the whole.
+        options: Budget.
+
+    Raises:
+        ArgumentError: If the frame has no depth or the window leaves the picture.
+
+    Source:
+        docs/design.md, master equation: I = T B + (1 - T) A behind particles that are themselves
+        seen through the air in front of them, all in linear light.
+    """
+    seed = check_seed("seed", seed)
+    if frame.depth_m is None:
+        raise ArgumentError(
+            f"frame {frame.key} has no depth; build a scene from the clip, or pass depth_m"
+        )
+    height, width = frame.image.shape[:2]
+    window = checked_window(window, height, width)
+    if weather.is_clear:
+        return _clear(frame, window)
+    outer = _with_margin(window, NEIGHBOURHOOD_PX // 2, height, width)
+    image, label, depth = _cut(frame, outer)
+    sky = depth == np.inf if label is None else label == SKY
+    fields = _fields(weather, seed, ambience)
+    resolved = [field.resolve(frame.camera, options.max_particles) for field in fields]
+    shot = _shade(frame, weather, ambience, outer, fields, resolved, image, depth, sky)
+    return _trimmed(shot, label, depth, outer, window, ambience.airlight)
+
+
+def checked_window(window: Window | None, height: int, width: int) -> Window:
+    """`window` as integers, or the whole picture; refuse one that leaves the picture."""
+    if window is None:
+        return (0, 0, height, width)
+    top, left, rows, columns = (int(v) for v in window)
+    if not (0 <= top and 0 <= left and rows > 0 and columns > 0):
+        raise ArgumentError(f"window {window} must be (top >= 0, left >= 0, height > 0, width > 0)")
+    if top + rows > height or left + columns > width:
+        raise ArgumentError(f"window {window} leaves the picture of {height}x{width} pixels")
+    return (top, left, rows, columns)
+
+
+def warm_up() -> None:
+    """Compile or load all kernels now, before worker processes are started."""
+    camera = Camera(
+        np.diag([16.0, 16.0, 1.0]) + [[0, 0, 8], [0, 0, 8], [0, 0, 0]], np.eye(4), 16, 16
+    )
+    axes = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    grey = np.full(3, 0.5)
+    ambience = Ambience(axes, grey, grey, grey, grey)
+    image = np.full((16, 16, 3), 128, np.uint8)
+    depth = np.full((16, 16), 20.0, np.float32)
+    from weather_aug.clip.types import FrameKey
+
+    frame = Frame(FrameKey(0, "warm-up"), 0.0, camera, image, None, depth)
+    storm = Weather.mix(Weather.rain("heavy"), Weather.snow("heavy"))
+    render(frame, storm, seed=0, ambience=ambience)
+
+
+def _clear(frame: Frame, window: Window) -> RenderedFrame:
+    image, label, depth = _cut(frame, window)
+    return RenderedFrame(
+        image.copy(),
+        None if label is None else label.copy(),
+        None if label is None else label.copy(),
+        np.zeros(depth.shape, np.uint8),
+        np.ones(depth.shape, np.float32),
+        depth,
+    )
+
+
+def _cut(frame: Frame, window: Window) -> tuple[UInt8, UInt8 | None, Float32]:
+    """Window of image and label (views) and of depth (a float32 copy, far and unknown as `inf`).
+
+    A label of sky outranks a measured depth: sensors see leaves and wires before it.
+    """
+    top, left, height, width = window
+    part = (slice(top, top + height), slice(left, left + width))
+    assert frame.depth_m is not None
+    depth = np.asarray(frame.depth_m[part]).astype(np.float32)
+    depth[~((depth > 0) & (depth < kernels.FAR_DEPTH_M))] = np.inf
+    label = None if frame.label is None else np.asarray(frame.label[part])
+    if label is not None:
+        depth[label == SKY] = np.inf
+    return np.asarray(frame.image[part]), label, depth
+
+
+def _with_margin(window: Window, margin: int, height: int, width: int) -> Window:
+    """The window and the pixels around it that its labels depend on."""
+    top, left, rows, columns = window
+    first, start = max(top - margin, 0), max(left - margin, 0)
+    end, stop = min(top + rows + margin, height), min(left + columns + margin, width)
+    return (first, start, end - first, stop - start)
+
+
+def _fields(weather: Weather, seed: int, ambience: Ambience) -> list[ParticleField]:
+    axes = ambience.axes_world
+    wind = np.asarray(weather.wind_m_per_s) @ axes
+    populations = []
+    if weather.rain_mm_per_h > 0:
+        populations.append(statistics.rain(weather.rain_mm_per_h))
+    if weather.snow_mm_per_h > 0:
+        populations.append(statistics.snow(weather.snow_mm_per_h))
+    return [ParticleField(population, seed, wind, axes) for population in populations]
+
+
+def _optics(camera: Camera, up_world: Float64) -> kernels.Optics:
+    up = camera.world_from_camera[:3, :3].T @ up_world
+    values = (
+        *camera.focal_px,
+        *camera.principal_px,
+        camera.exposure_s,
+        camera.aperture_m,
+        *camera.angular_velocity_rad_per_s,
+        *up,
+        camera.width * camera.height,
+    )
+    return kernels.Optics(*(np.float32(v) for v in values))
+
+
+def _medium(weather: Weather, fields: list[ParticleField]) -> kernels.Medium:
+    values = (
+        weather.fog_per_m,
+        1.0 / weather.fog_scale_height_m,
+        weather.mist_per_km * 1e-3,
+        sum(field.population.extinction_per_m for field in fields),
+        FAR_M / DEPTH_BINS,
+    )
+    return kernels.Medium(*(np.float32(v) for v in values))
+
+
+def _shade(
+    frame: Frame,
+    weather: Weather,
+    ambience: Ambience,
+    window: Window,
+    fields: list[ParticleField],
+    resolved: list[Resolved],
+    image: UInt8,
+    depth: Float32,
+    sky: NDArray[np.bool_],
+) -> dict[str, Any]:
+    """Run the kernels over a window; planes of its size come back."""
+    optics = _optics(frame.camera, ambience.axes_world[2])
+    medium = _medium(weather, fields)
+    carried = np.zeros(DEPTH_BINS + 1, np.float32)
+    for part in resolved:
+        carried = carried + part.optical_depth
+    airlight = ambience.airlight.astype(np.float32)
+    splats = _splats(frame, weather, ambience, window, fields, resolved, optics, medium, carried)
+    _, _, height, width = window
+    bands = -(-height // kernels.BAND_ROWS)
+    order, band_starts = kernels.order_by_band(splats, window, bands)
+    curve, matrix = tone(weather.overcast)
+    planes = {
+        "image": np.empty((height, width, 3), np.uint8),
+        "transmittance": np.empty((height, width), np.float32),
+        "gap": np.empty((height, width), np.float32),
+        "covered": np.zeros((height, width), np.uint8),
+    }
+    kernels.compose(
+        np.ascontiguousarray(image),
+        depth,
+        np.ascontiguousarray(sky),
+        window,
+        optics,
+        medium,
+        carried,
+        curve.astype(np.float32),
+        matrix.astype(np.float32),
+        kernels.Tone(
+            np.float32(weather.overcast),
+            np.float32(max(float(ambience.sky @ LUMINANCE), 0.05)),
+            np.float32(ZENITH_GAIN),
+        ),
+        airlight,
+        splats,
+        order,
+        band_starts,
+        _falloff(),
+        _encode(),
+        *planes.values(),
+    )
+    return planes
+
+
+def _splats(
+    frame: Frame,
+    weather: Weather,
+    ambience: Ambience,
+    window: Window,
+    fields: list[ParticleField],
+    resolved: list[Resolved],
+    optics: kernels.Optics,
+    medium: kernels.Medium,
+    carried: Float32,
+) -> Float32:
+    """(N, 12) screen-space particles of all fields that touch the window."""
+    light = ambience.under(weather.overcast)
+    airlight = ambience.airlight.astype(np.float32)
+    colours = {"rain": rain_colour, "snow": snow_colour}
+    found = []
+    for field, part in zip(fields, resolved, strict=True):
+        particles = field.particles(frame.camera, frame.time_s, part, window)
+        splats = np.empty((len(particles), 12), np.float32)
+        colour = colours[field.population.kind](light).astype(np.float32)
+        count = kernels.project(
+            particles, optics, medium, carried, colour, airlight, window, splats
+        )
+        found.append(splats[:count])
+    return np.concatenate(found) if found else np.empty((0, 12), np.float32)
+
+
+def _trimmed(
+    shot: dict[str, Any],
+    label: UInt8 | None,
+    depth: Float32,
+    outer: Window,
+    window: Window,
+    airlight: Float64,
+) -> RenderedFrame:
+    """Labels from the outer window, then everything cut to the inner one."""
+    top, left = window[0] - outer[0], window[1] - outer[1]
+    part = (slice(top, top + window[2]), slice(left, left + window[3]))
+    seen = np.zeros(depth.shape, np.uint8) if label is None else label
+    honest, invalid = readable_labels(
+        seen, shot["transmittance"], shot["gap"], shot["covered"], airlight
+    )
+    cut = np.ascontiguousarray
+    return RenderedFrame(
+        image=cut(shot["image"][part]),
+        label=None if label is None else cut(honest[part]),
+        label_full=None if label is None else label[part].copy(),
+        invalid=cut(invalid[part]),
+        transmittance=cut(shot["transmittance"][part]),
+        depth=cut(depth[part]),
+    )
+
+
+@lru_cache(maxsize=1)
+def _encode() -> UInt8:
+    return encode_table()
+
+
+@lru_cache(maxsize=1)
+def _falloff() -> Float32:
+    """exp(-x / 2) at the middle of each step of x in [0, 12.5)."""
+    x = (np.arange(FALLOFF_STEPS) + 0.5) * (12.5 / FALLOFF_STEPS)
+    return np.exp(-0.5 * x).astype(np.float32)

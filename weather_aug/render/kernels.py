@@ -1,0 +1,428 @@
+"""Compiled loops of the renderer: project particles, order them, shade the picture band by band.
+
+All colours are linear light. Serial, without fast-math, so that the same arguments give the same
+bits in every process; every pixel goes through the same operations whether the whole picture or a
+window of it is rendered.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+BAND_ROWS = 32
+DEPTH_KEYS = 4096
+FAR_DEPTH_M = 60000.0
+"""float16 ends here; a greater depth is the sky or beyond measure."""
+FAINTEST = 1.0 / 512.0
+"""Opacity at which a particle's footprint is cut."""
+
+
+class Optics(NamedTuple):
+    """Camera of the whole picture, float32."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    exposure_s: float
+    aperture_m: float
+    turn_x: float
+    turn_y: float
+    turn_z: float
+    up_x: float
+    up_y: float
+    up_z: float
+    area_px: float
+
+
+class Medium(NamedTuple):
+    """What is between the camera and the surfaces, float32; extinctions in 1/m."""
+
+    fog_per_m: float
+    inverse_height_per_m: float
+    haze_per_m: float
+    precipitation_per_m: float
+    resolved_step_m: float
+
+
+class Tone(NamedTuple):
+    """How the weather's light changes the recorded colours, float32."""
+
+    overcast: float
+    sky_luminance: float
+    zenith_gain: float
+
+
+@numba.njit(cache=True, nogil=True)
+def survival(optical_depth):
+    """exp(-x) for x in [-16, 80] to 2e-5, in operations that give equal bits on every machine."""
+    x = optical_depth * np.float32(-0.015625)
+    one = np.float32(1.0)
+    p = one + x * np.float32(1.0 / 6.0)
+    p = one + x * np.float32(0.2) * p
+    p = one + x * np.float32(0.25) * p
+    p = one + x * np.float32(1.0 / 3.0) * p
+    p = one + x * np.float32(0.5) * p
+    p = one + x * p
+    p = p * p
+    p = p * p
+    p = p * p
+    p = p * p
+    p = p * p
+    return p * p
+
+
+@numba.njit(cache=True, nogil=True)
+def path_optical_depth(z, ray_x, ray_y, optics, medium, resolved_depth):
+    """Optical depth of the air from the camera to depth z along the ray (ray_x, ray_y, 1)."""
+    zero, one = np.float32(0.0), np.float32(1.0)
+    norm = np.sqrt(one + ray_x * ray_x + ray_y * ray_y)
+    rise = optics.up_x * ray_x + optics.up_y * ray_y + optics.up_z
+    if z >= np.float32(FAR_DEPTH_M):
+        sine = max(rise / norm, np.float32(0.05))
+        z = min(np.float32(1000.0) / sine, np.float32(20000.0)) / norm
+    path_m = z * norm
+    heights = min(max(z * rise * medium.inverse_height_per_m, np.float32(-8.0)), np.float32(80.0))
+    if abs(heights) < np.float32(1e-3):
+        share = one - np.float32(0.5) * heights
+    else:
+        share = (one - survival(heights)) / heights
+    last = np.int32(resolved_depth.shape[0] - 1)
+    # Compared as a float first: the sky's bin does not fit an integer's range on every machine.
+    position = min(z * (one / medium.resolved_step_m), np.float32(last))
+    resolved = resolved_depth[np.int32(position)]
+    tau = (medium.fog_per_m * share + medium.haze_per_m) * path_m
+    tau += max(medium.precipitation_per_m * z - resolved, zero) * norm
+    return min(tau, np.float32(60.0))
+
+
+@numba.njit(cache=True, nogil=True)
+def project(particles, optics, medium, resolved_depth, colour, airlight, window, splats):
+    """Turn particles into screen-space Gaussians, keeping those that touch the window.
+
+    A disc of diameter D is a Gaussian of standard deviation D / (2 sqrt 2) and peak opacity 1 (equal
+    area). A uniform sweep q adds q q^T / 12, defocus of diameter c adds c^2 / 16, the pixel filter
+    0.3 px^2; the peak falls by the square root of the ratio of determinants, so that the opacity
+    integrated over the picture is the silhouette's, whatever the resolution or exposure.
+
+    Args:
+        particles: (N, 7) float32, as `ParticleField.particles` returns them.
+        optics: Camera.
+        medium: Air.
+        resolved_depth: Optical depth of resolved particles by depth.
+        colour: (3,) float32 of a particle.
+        airlight: (3,) float32.
+        window: (top, left, height, width).
+        splats: (N, 12) float32 out: u, v, conic a b c, reach^2, peak, depth, rgb, covers.
+
+    Returns:
+        Number of splats.
+    """
+    count = 0
+    one = np.float32(1.0)
+    twelfth = np.float32(1.0 / 12.0)
+    top, left, height, width = window
+    large_area = np.float32(1e-3) * optics.area_px
+    for i in range(particles.shape[0]):
+        x, y, z = particles[i, 0], particles[i, 1], particles[i, 2]
+        inverse = one / z
+        tx, ty = x * inverse, y * inverse
+        sx, sy = optics.fx * inverse, optics.fy * inverse
+        t = optics.exposure_s
+        ux = t * (particles[i, 3] - (optics.turn_y * z - optics.turn_z * y))
+        uy = t * (particles[i, 4] - (optics.turn_z * x - optics.turn_x * z))
+        uz = t * (particles[i, 5] - (optics.turn_x * y - optics.turn_y * x))
+        qx, qy = sx * (ux - tx * uz), sy * (uy - ty * uz)
+        s2 = np.float32(0.125) * particles[i, 6] * particles[i, 6]
+        a0 = s2 * sx * sx * (one + tx * tx)
+        b0 = s2 * sx * sy * tx * ty
+        c0 = s2 * sy * sy * (one + ty * ty)
+        blur = optics.aperture_m * (inverse - np.float32(1.0 / 6.0))
+        soft_x = blur * optics.fx
+        soft = np.float32(0.3) + soft_x * soft_x * np.float32(0.0625)
+        a = a0 + qx * qx * twelfth + soft
+        b = b0 + qx * qy * twelfth
+        c = c0 + qy * qy * twelfth + soft
+        det = a * c - b * b
+        peak = np.sqrt(max(a0 * c0 - b0 * b0, np.float32(0.0)) / det) + np.float32(FAINTEST)
+        peak = min(peak, np.float32(0.99))
+        reach2 = np.float32(2.0) * np.float32(np.log(np.float64(peak * np.float32(512.0))))
+        if reach2 <= np.float32(0.0):
+            continue
+        u, v = optics.cx + optics.fx * tx, optics.cy + optics.fy * ty
+        half_u, half_v = np.sqrt(reach2 * a), np.sqrt(reach2 * c)
+        if u + half_u < left or u - half_u > left + width - 1:
+            continue
+        if v + half_v < top or v - half_v > top + height - 1:
+            continue
+        through = survival(path_optical_depth(z, tx, ty, optics, medium, resolved_depth))
+        row = splats[count]
+        row[0], row[1] = u, v
+        row[2], row[3], row[4] = c / det, -b / det, a / det
+        row[5], row[6], row[7] = reach2, peak, z
+        for k in range(3):
+            row[8 + k] = through * colour[k] + (one - through) * airlight[k]
+        area = np.float32(np.pi) * reach2 * np.sqrt(det)
+        row[11] = one if area > large_area else np.float32(0.0)
+        count += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def order_by_band(splats, window, bands):
+    """Indices of splats band by band, far to near inside each, and where each band starts.
+
+    Counting sorts only, so that equal depths keep the field's own order in any window.
+    """
+    n = splats.shape[0]
+    keys = np.empty(n, np.int32)
+    starts = np.zeros(DEPTH_KEYS + 1, np.int64)
+    for i in range(n):
+        # Inverse depth from 0 (far) to 2 (the near limit of 0.5 m).
+        key = np.int32(min(np.float32(2047.0) / splats[i, 7], np.float32(DEPTH_KEYS - 1)))
+        keys[i] = key
+        starts[key + 1] += 1
+    for k in range(DEPTH_KEYS):
+        starts[k + 1] += starts[k]
+    far_to_near = np.empty(n, np.int32)
+    for i in range(n):
+        far_to_near[starts[keys[i]]] = i
+        starts[keys[i]] += 1
+
+    top, _, height, _ = window
+    band_starts = np.zeros(bands + 1, np.int64)
+    first = np.empty(n, np.int32)
+    last = np.empty(n, np.int32)
+    for i in range(n):
+        half = np.sqrt(splats[i, 5] * splats[i, 2] / _det(splats[i]))
+        low = max(np.int64(np.floor(splats[i, 1] - half)) - top, 0)
+        high = min(np.int64(np.ceil(splats[i, 1] + half)) - top, height - 1)
+        first[i], last[i] = low // BAND_ROWS, high // BAND_ROWS
+        for band in range(first[i], last[i] + 1):
+            band_starts[band + 1] += 1
+    for band in range(bands):
+        band_starts[band + 1] += band_starts[band]
+    order = np.empty(band_starts[bands], np.int32)
+    fill = band_starts[:-1].copy()
+    for k in range(n):
+        i = far_to_near[k]
+        for band in range(first[i], last[i] + 1):
+            order[fill[band]] = i
+            fill[band] += 1
+    return order, band_starts
+
+
+@numba.njit(cache=True, nogil=True)
+def _det(splat):
+    """Determinant of the conic, the inverse of the covariance's."""
+    return splat[2] * splat[4] - splat[3] * splat[3]
+
+
+@numba.njit(cache=True, nogil=True)
+def _transmittance_row(depth, ray_x, ray_y, optics, medium, resolved_depth, tau, slant, out):
+    """`path_optical_depth` and `survival` of one row, in loops that the compiler can vectorise."""
+    zero, one = np.float32(0.0), np.float32(1.0)
+    across = one + ray_y * ray_y
+    rise_y = optics.up_y * ray_y + optics.up_z
+    far, nearly_flat = np.float32(FAR_DEPTH_M), np.float32(0.05)
+    layer_m, longest_m = np.float32(1000.0), np.float32(20000.0)
+    width = depth.shape[0]
+    for x in range(width):
+        norm = np.sqrt(across + ray_x[x] * ray_x[x])
+        rise = optics.up_x * ray_x[x] + rise_y
+        sine = rise / norm
+        sine = sine if sine > nearly_flat else nearly_flat
+        beyond_m = layer_m / sine
+        beyond_m = beyond_m if beyond_m < longest_m else longest_m
+        z = depth[x]
+        z = z if z < far else beyond_m / norm
+        slant[x] = norm
+        out[x] = z
+        tau[x] = medium.haze_per_m * z * norm
+    if medium.inverse_height_per_m == zero:
+        for x in range(width):
+            tau[x] += medium.fog_per_m * out[x] * slant[x]
+    else:
+        lowest, highest, tiny = np.float32(-8.0), np.float32(80.0), np.float32(1e-3)
+        for x in range(width):
+            rise = optics.up_x * ray_x[x] + rise_y
+            heights = out[x] * rise * medium.inverse_height_per_m
+            heights = heights if heights > lowest else lowest
+            heights = heights if heights < highest else highest
+            away = heights if abs(heights) > tiny else tiny
+            share = (one - survival(away)) / away
+            share = share if abs(heights) > tiny else one - np.float32(0.5) * heights
+            tau[x] += medium.fog_per_m * share * out[x] * slant[x]
+    if medium.precipitation_per_m > zero:
+        last = np.float32(resolved_depth.shape[0] - 1)
+        per_metre = one / medium.resolved_step_m
+        for x in range(width):
+            position = out[x] * per_metre
+            position = position if position < last else last
+            rest = medium.precipitation_per_m * out[x] - resolved_depth[np.int32(position)]
+            tau[x] += (rest if rest > zero else zero) * slant[x]
+    most = np.float32(60.0)
+    for x in range(width):
+        out[x] = survival(tau[x] if tau[x] < most else most)
+
+
+@numba.njit(cache=True, nogil=True)
+def _shade_row(
+    image, sky, ray_x, ray_y, optics, linear, matrix, tone, airlight, through, light, gap
+):
+    """Tone and fog of one row: linear light out, and how far the surface is from the airlight."""
+    one = np.float32(1.0)
+    a0, a1, a2 = airlight[0], airlight[1], airlight[2]
+    for x in range(image.shape[0]):
+        r, g, b = linear[image[x, 0]], linear[image[x, 1]], linear[image[x, 2]]
+        red = matrix[0, 0] * r + matrix[0, 1] * g + matrix[0, 2] * b
+        green = matrix[1, 0] * r + matrix[1, 1] * g + matrix[1, 2] * b
+        blue = matrix[2, 0] * r + matrix[2, 1] * g + matrix[2, 2] * b
+        if sky[x]:
+            y = np.float32(0.2126) * r + np.float32(0.7152) * g + np.float32(0.0722) * b
+            # Leaves and wires inside the sky's label are dark: they stay what they are.
+            matte = (y / tone.sky_luminance - np.float32(0.3)) * np.float32(3.0)
+            weight = tone.overcast * min(max(matte, np.float32(0.0)), one)
+            norm = np.sqrt(one + ray_x[x] * ray_x[x] + ray_y * ray_y)
+            sine = (optics.up_x * ray_x[x] + optics.up_y * ray_y + optics.up_z) / norm
+            brighter = one + tone.zenith_gain * max(sine, np.float32(0.0))
+            red += weight * (a0 * brighter - red)
+            green += weight * (a1 * brighter - green)
+            blue += weight * (a2 * brighter - blue)
+        t = through[x]
+        dr, dg, db = red - a0, green - a1, blue - a2
+        light[x, 0], light[x, 1], light[x, 2] = a0 + t * dr, a1 + t * dg, a2 + t * db
+        gap[x] = max(abs(dr), max(abs(dg), abs(db)))
+
+
+@numba.njit(cache=True, nogil=True)
+def _blend_splat(splat, rows, window, depth, falloff, light, through, covered):
+    """Blend one splat over rows [rows[0], rows[1]) of the window; `light` starts at rows[0]."""
+    u, v = splat[0], splat[1]
+    a, b, c, reach2, peak, z = splat[2], splat[3], splat[4], splat[5], splat[6], splat[7]
+    red, green, blue = splat[8], splat[9], splat[10]
+    top, left, _, width = window
+    scale = np.float32(falloff.shape[0] / 12.5)
+    det = a * c - b * b
+    half_v = np.sqrt(reach2 * a / det)
+    y0 = max(np.int64(np.ceil(v - half_v)) - top, rows[0])
+    y1 = min(np.int64(np.floor(v + half_v)) - top, rows[1] - 1)
+    for y in range(y0, y1 + 1):
+        dy = np.float32(y + top) - v
+        room = a * reach2 - det * dy * dy
+        if room <= np.float32(0.0):
+            continue
+        middle = u - b * dy / a
+        half = np.sqrt(room) / a
+        x0 = max(np.int64(np.ceil(middle - half)) - left, 0)
+        x1 = min(np.int64(np.floor(middle + half)) - left, width - 1)
+        for x in range(x0, x1 + 1):
+            ahead = depth[y, x] - z
+            if ahead <= np.float32(-0.1):
+                continue
+            dx = np.float32(x + left) - u
+            power = a * dx * dx + np.float32(2.0) * b * dx * dy + c * dy * dy
+            slot = min(np.int64(power * scale), falloff.shape[0] - 1)
+            alpha = peak * falloff[slot]
+            if ahead < np.float32(0.1):
+                alpha *= np.float32(0.5) + np.float32(5.0) * ahead
+            pixel = light[y - rows[0], x]
+            pixel[0] += alpha * (red - pixel[0])
+            pixel[1] += alpha * (green - pixel[1])
+            pixel[2] += alpha * (blue - pixel[2])
+            through[y, x] *= np.float32(1.0) - alpha
+            if splat[11] > np.float32(0.0) and alpha > np.float32(0.5):
+                covered[y, x] = 1
+
+
+@numba.njit(cache=True, nogil=True)
+def compose(
+    image,
+    depth,
+    sky,
+    window,
+    optics,
+    medium,
+    resolved_depth,
+    linear,
+    matrix,
+    tone,
+    airlight,
+    splats,
+    order,
+    band_starts,
+    falloff,
+    encode,
+    out,
+    through,
+    gap,
+    covered,
+):
+    """Render the window: tone, fog and particles in linear light, band by band.
+
+    Args:
+        image: (H, W, 3) uint8 of the window.
+        depth: (H, W) float32 z-depth of the window, `inf` for far.
+        sky: (H, W) bool of the window.
+        window: (top, left, height, width) in the whole picture.
+        optics: Camera of the whole picture.
+        medium: Air.
+        resolved_depth: Optical depth of resolved particles by depth.
+        linear: (256,) float32 toned linear light by sRGB level.
+        matrix: (3, 3) float32 colour matrix after it.
+        tone: Sky.
+        airlight: (3,) float32.
+        splats: (N, 12) float32.
+        order: Splat indices by band.
+        band_starts: (bands + 1,).
+        falloff: exp(-x / 2) for x in [0, 12.5), float32.
+        encode: (4096,) uint8 sRGB level by linear light.
+        out: (H, W, 3) uint8 out.
+        through: (H, W) float32 out: transmittance of air and particles.
+        gap: (H, W) float32 out: largest linear difference of the surface from the airlight.
+        covered: (H, W) uint8, zero: set where a large particle hides the surface.
+    """
+    top, left, height, width = window
+    ray_x = np.empty(width, np.float32)
+    for x in range(width):
+        ray_x[x] = (np.float32(x + left) - optics.cx) / optics.fx
+    light = np.empty((BAND_ROWS, width, 3), np.float32)
+    tau = np.empty(width, np.float32)
+    slant = np.empty(width, np.float32)
+    last = np.float32(encode.shape[0] - 1)
+    half = np.float32(0.5)
+    for band in range(band_starts.shape[0] - 1):
+        y0 = band * BAND_ROWS
+        y1 = min(y0 + BAND_ROWS, height)
+        for y in range(y0, y1):
+            ray_y = (np.float32(y + top) - optics.cy) / optics.fy
+            _transmittance_row(
+                depth[y], ray_x, ray_y, optics, medium, resolved_depth, tau, slant, through[y]
+            )
+            _shade_row(
+                image[y],
+                sky[y],
+                ray_x,
+                ray_y,
+                optics,
+                linear,
+                matrix,
+                tone,
+                airlight,
+                through[y],
+                light[y - y0],
+                gap[y],
+            )
+        for k in range(band_starts[band], band_starts[band + 1]):
+            _blend_splat(
+                splats[order[k]], (y0, y1), window, depth, falloff, light, through, covered
+            )
+        for y in range(y0, y1):
+            row = light[y - y0]
+            for x in range(width):
+                for k in range(3):
+                    value = min(max(row[x, k], np.float32(0.0)), np.float32(1.0))
+                    out[y, x, k] = encode[np.int32(value * last + half)]

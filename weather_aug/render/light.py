@@ -1,0 +1,172 @@
+"""sRGB and linear light, the light of a scene, and how weather changes it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weather_aug.clip.types import Frame
+from weather_aug.render.kernels import FAR_DEPTH_M
+from weather_aug.taxonomy import GROUND, SKY
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Rec. 709 weights of linear RGB."""
+ENCODE_LEVELS = 4096
+MIDDLE_GREY = 0.18
+AIRLIGHT_SATURATION = 0.1
+AIRLIGHT_SRGB = (0.60, 0.88)
+"""Range of the airlight's luminance; a recorded sky may be night-blue or burnt out."""
+SAMPLES_PER_SIDE = 96
+
+
+def linear_from_srgb(value: Float64) -> Float64:
+    """Linear light in [0, 1] of an sRGB value in [0, 1] (IEC 61966-2-1)."""
+    value = np.asarray(value, np.float64)
+    linear: Float64 = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    return linear
+
+
+def srgb_from_linear(value: Float64) -> Float64:
+    """sRGB value in [0, 1] of linear light in [0, 1] (IEC 61966-2-1)."""
+    value = np.asarray(value, np.float64)
+    low, high = value * 12.92, 1.055 * np.maximum(value, 1e-12) ** (1 / 2.4) - 0.055
+    srgb: Float64 = np.where(value <= 0.0031308, low, high)
+    return srgb
+
+
+@dataclass(frozen=True, eq=False)
+class Ambience:
+    """The light around a camera and the axes of its street; colours are (3,) linear RGB.
+
+    Convention:
+        `axes_world` (3, 3) has the rows along the street (the clip's first heading), to the left,
+        up; all unit vectors in world axes. `sky`, `middle` and `ground` are medians of the recorded
+        picture; `airlight` is what fog looks like, one for the whole clip.
+    """
+
+    axes_world: Float64
+    sky: Float64
+    middle: Float64
+    ground: Float64
+    airlight: Float64
+
+    def under(self, overcast: float) -> Ambience:
+        """The same light after the weather's tone and sky."""
+        curve, matrix = tone(overcast)
+        toned = {
+            name: matrix @ np.interp(getattr(self, name), linear_from_srgb(_LEVELS), curve)
+            for name in ("sky", "middle", "ground")
+        }
+        toned["sky"] = toned["sky"] + overcast * (self.airlight - toned["sky"])
+        return replace(self, **toned)
+
+
+_LEVELS = np.arange(256) / 255.0
+
+
+def ambience_of(frame: Frame, axes_world: Float64) -> Ambience:
+    """Measure the light in one picture, on a grid of at most 96 x 96 pixels.
+
+    Where the picture shows no sky, the brightest twentieth stands for it; where nothing is labelled
+    as ground, the lowest third does.
+    """
+    height, width = frame.image.shape[:2]
+    step = (
+        slice(None, None, -(-height // SAMPLES_PER_SIDE)),
+        slice(None, None, -(-width // SAMPLES_PER_SIDE)),
+    )
+    light = linear_from_srgb(frame.image[step] / 255.0)
+    rows = np.broadcast_to(np.arange(light.shape[0])[:, None], light.shape[:2])
+    if frame.label is not None:
+        label = frame.label[step]
+        is_sky, is_ground = label == SKY, np.isin(label, GROUND)
+    else:
+        is_sky = np.zeros(light.shape[:2], bool)
+        if frame.depth_m is not None:
+            is_sky = frame.depth_m[step].astype(np.float32) >= FAR_DEPTH_M
+        is_ground = (rows >= light.shape[0] * 2 // 3) & ~is_sky
+    middle = light[~is_sky & ~is_ground]
+    sky = _sky_colour(light, is_sky)
+    whole = np.median(light.reshape(-1, 3), axis=0)
+    return Ambience(
+        axes_world=axes_world,
+        sky=sky,
+        middle=np.median(middle, axis=0) if len(middle) else whole,
+        ground=np.median(light[is_ground], axis=0) if is_ground.any() else whole,
+        airlight=airlight_from_sky(sky),
+    )
+
+
+def _sky_colour(light: Float64, is_sky: NDArray[np.bool_]) -> Float64:
+    """Median of the lower third of the sky, which is what fog fades to."""
+    if is_sky.sum() >= 0.002 * is_sky.size:
+        rows = np.nonzero(is_sky)[0]
+        low = is_sky & (np.arange(len(light))[:, None] >= np.quantile(rows, 2 / 3))
+        return np.asarray(np.median(light[low], axis=0))
+    luminance = light @ LUMINANCE
+    return np.asarray(np.median(light[luminance >= np.quantile(luminance, 0.95)], axis=0))
+
+
+def airlight_from_sky(sky: Float64) -> Float64:
+    """Airlight of a sky colour: nearly grey, its luminance kept within what fog can look like."""
+    luminance = float(sky @ LUMINANCE)
+    low, high = linear_from_srgb(np.array(AIRLIGHT_SRGB))
+    target = min(max(luminance, float(low)), float(high))
+    tinted = luminance + AIRLIGHT_SATURATION * (sky - luminance)
+    return (
+        np.asarray(tinted * (target / max(luminance, 1e-6)))
+        if luminance > 1e-6
+        else np.full(3, low)
+    )
+
+
+def tone(overcast: float) -> tuple[Float64, Float64]:
+    """How an overcast sky changes recorded colours.
+
+    Contrast falls by a quarter about middle grey, saturation by a third, the white turns from 6500 K
+    to about 7200 K; the auto-exposure hides most of the lost light.
+
+    Args:
+        overcast: In [0, 1]; 0 changes nothing.
+
+    Returns:
+        Linear light (256,) of each sRGB level after the change of contrast and exposure, and the
+        colour matrix (3, 3) to apply after it.
+    """
+    light = linear_from_srgb(_LEVELS)
+    contrast = 1.0 - 0.25 * overcast
+    gain = 1.0 - 0.15 * overcast * (1.0 - 0.8)
+    curve = gain * MIDDLE_GREY * (light / MIDDLE_GREY) ** contrast if overcast else light
+    saturation = 1.0 - 0.35 * overcast
+    grey = np.broadcast_to(LUMINANCE, (3, 3))
+    white = 1.0 + overcast * (np.array([0.96, 1.00, 1.05]) - 1.0)
+    matrix = white[:, None] * (saturation * np.eye(3) + (1.0 - saturation) * grey)
+    return np.minimum(curve, 1.0), matrix
+
+
+def rain_colour(ambience: Ambience) -> Float64:
+    """Linear colour of a drop: an inverted view of 165 degrees of its surroundings.
+
+    Source:
+        Garg and Nayar (2007): a drop refracts sky, horizon and ground; 6 % is reflected light.
+    """
+    refracted = 0.45 * ambience.sky + 0.20 * ambience.middle + 0.35 * ambience.ground
+    mean = (ambience.sky + ambience.middle + ambience.ground) / 3
+    return np.asarray(0.94 * refracted + 0.06 * mean)
+
+
+def snow_colour(ambience: Ambience) -> Float64:
+    """Linear colour of a flake: diffuse, lit from above and below, never brighter than the sky."""
+    diffuse = 0.9 * 0.5 * (ambience.sky + ambience.ground)
+    return np.minimum(diffuse, 0.98 * ambience.sky)
+
+
+def encode_table() -> NDArray[np.uint8]:
+    """(4096,) sRGB level of linear light k / 4095."""
+    light = np.arange(ENCODE_LEVELS) / (ENCODE_LEVELS - 1)
+    return np.round(255 * srgb_from_linear(light)).astype(np.uint8)

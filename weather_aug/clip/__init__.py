@@ -1,0 +1,1 @@
+"""A drive on disk becomes a Clip of frames."""

@@ -1,0 +1,1 @@
+"""A frame gets the weather's background."""

@@ -1,0 +1,1 @@
+"""Weather, seed and time become particles in the air."""

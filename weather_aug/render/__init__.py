@@ -1,0 +1,1 @@
+"""Frame, particles and medium become a picture with labels."""

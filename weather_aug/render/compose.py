@@ -11,21 +11,16 @@ from numpy.typing import NDArray
 
 from weather_aug._checks import finite
 from weather_aug._keys import check_seed
-from weather_aug.clip.types import Camera, Frame
+from weather_aug.clip.types import Camera, Frame, FrameKey
+from weather_aug.colour import LUMINANCE, encode_table
+from weather_aug.edit.physical.overcast import tone
 from weather_aug.errors import ArgumentError
 from weather_aug.particles import statistics
 from weather_aug.particles.field import MAX_PARTICLES, ParticleField, Window
 from weather_aug.particles.resolve import DEPTH_BINS, FAR_M, Resolved
 from weather_aug.render import kernels
 from weather_aug.render.label import NEIGHBOURHOOD_PX, readable_labels
-from weather_aug.render.light import (
-    LUMINANCE,
-    Ambience,
-    encode_table,
-    rain_colour,
-    snow_colour,
-    tone,
-)
+from weather_aug.render.light import Ambience, rain_colour, snow_colour
 from weather_aug.taxonomy import SKY
 from weather_aug.weather import Weather
 
@@ -130,16 +125,13 @@ def checked_window(window: Window | None, height: int, width: int) -> Window:
 
 def warm_up() -> None:
     """Compile or load all kernels now, before worker processes are started."""
-    camera = Camera(
-        np.diag([16.0, 16.0, 1.0]) + [[0, 0, 8], [0, 0, 8], [0, 0, 0]], np.eye(4), 16, 16
-    )
+    intrinsics = np.array([[16.0, 0, 8], [0, 16, 8], [0, 0, 1]])
+    camera = Camera(intrinsics, np.eye(4), 16, 16)
     axes = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     grey = np.full(3, 0.5)
     ambience = Ambience(axes, grey, grey, grey, grey)
     image = np.full((16, 16, 3), 128, np.uint8)
     depth = np.full((16, 16), 20.0, np.float32)
-    from weather_aug.clip.types import FrameKey
-
     frame = Frame(FrameKey(0, "warm-up"), 0.0, camera, image, None, depth)
     storm = Weather.mix(Weather.rain("heavy"), Weather.snow("heavy"))
     render(frame, storm, seed=0, ambience=ambience)

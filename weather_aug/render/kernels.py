@@ -23,37 +23,37 @@ FAINTEST = 1.0 / 512.0
 class Optics(NamedTuple):
     """Camera of the whole picture, float32."""
 
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    exposure_s: float
-    aperture_m: float
-    turn_x: float
-    turn_y: float
-    turn_z: float
-    up_x: float
-    up_y: float
-    up_z: float
-    area_px: float
+    fx: np.float32
+    fy: np.float32
+    cx: np.float32
+    cy: np.float32
+    exposure_s: np.float32
+    aperture_m: np.float32
+    turn_x: np.float32
+    turn_y: np.float32
+    turn_z: np.float32
+    up_x: np.float32
+    up_y: np.float32
+    up_z: np.float32
+    area_px: np.float32
 
 
 class Medium(NamedTuple):
     """What is between the camera and the surfaces, float32; extinctions in 1/m."""
 
-    fog_per_m: float
-    inverse_height_per_m: float
-    haze_per_m: float
-    precipitation_per_m: float
-    resolved_step_m: float
+    fog_per_m: np.float32
+    inverse_height_per_m: np.float32
+    haze_per_m: np.float32
+    precipitation_per_m: np.float32
+    resolved_step_m: np.float32
 
 
 class Tone(NamedTuple):
     """How the weather's light changes the recorded colours, float32."""
 
-    overcast: float
-    sky_luminance: float
-    zenith_gain: float
+    overcast: np.float32
+    sky_luminance: np.float32
+    zenith_gain: np.float32
 
 
 @numba.njit(cache=True, nogil=True)
@@ -103,9 +103,9 @@ def path_optical_depth(z, ray_x, ray_y, optics, medium, resolved_depth):
 def project(particles, optics, medium, resolved_depth, colour, airlight, window, splats):
     """Turn particles into screen-space Gaussians, keeping those that touch the window.
 
-    A disc of diameter D is a Gaussian of standard deviation D / (2 sqrt 2) and peak opacity 1 (equal
-    area). A uniform sweep q adds q q^T / 12, defocus of diameter c adds c^2 / 16, the pixel filter
-    0.3 px^2; the peak falls by the square root of the ratio of determinants, so that the opacity
+    A disc of diameter D is a Gaussian of standard deviation D / (2 sqrt 2) and peak opacity 1
+    (equal area). A uniform sweep q adds q q^T / 12, defocus of diameter c adds c^2 / 16, the pixel
+    filter 0.3 px^2; the peak falls by the square root of the ratio of determinants, so that the opacity
     integrated over the picture is the silhouette's, whatever the resolution or exposure.
 
     Args:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from weather_aug.render.light import LUMINANCE
+from weather_aug.colour import LUMINANCE
 from weather_aug.taxonomy import IGNORE, SKY
 
 Float32 = NDArray[np.float32]

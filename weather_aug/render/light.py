@@ -1,4 +1,4 @@
-"""sRGB and linear light, the light of a scene, and how weather changes it."""
+"""The light of a scene: what its sky, its surfaces and its ground look like, and its airlight."""
 
 from __future__ import annotations
 
@@ -8,35 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug.clip.types import Frame
+from weather_aug.colour import LUMINANCE, SRGB_LEVELS_LINEAR, linear_from_srgb
+from weather_aug.edit.physical.overcast import tone
 from weather_aug.render.kernels import FAR_DEPTH_M
 from weather_aug.taxonomy import GROUND, SKY
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Rec. 709 weights of linear RGB."""
-ENCODE_LEVELS = 4096
-MIDDLE_GREY = 0.18
 AIRLIGHT_SATURATION = 0.1
 AIRLIGHT_SRGB = (0.60, 0.88)
 """Range of the airlight's luminance; a recorded sky may be night-blue or burnt out."""
 SAMPLES_PER_SIDE = 96
-
-
-def linear_from_srgb(value: Float64) -> Float64:
-    """Linear light in [0, 1] of an sRGB value in [0, 1] (IEC 61966-2-1)."""
-    value = np.asarray(value, np.float64)
-    linear: Float64 = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-    return linear
-
-
-def srgb_from_linear(value: Float64) -> Float64:
-    """sRGB value in [0, 1] of linear light in [0, 1] (IEC 61966-2-1)."""
-    value = np.asarray(value, np.float64)
-    low, high = value * 12.92, 1.055 * np.maximum(value, 1e-12) ** (1 / 2.4) - 0.055
-    srgb: Float64 = np.where(value <= 0.0031308, low, high)
-    return srgb
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +42,11 @@ class Ambience:
         """The same light after the weather's tone and sky."""
         curve, matrix = tone(overcast)
         toned = {
-            name: matrix @ np.interp(getattr(self, name), linear_from_srgb(_LEVELS), curve)
+            name: matrix @ np.interp(getattr(self, name), SRGB_LEVELS_LINEAR, curve)
             for name in ("sky", "middle", "ground")
         }
         toned["sky"] = toned["sky"] + overcast * (self.airlight - toned["sky"])
         return replace(self, **toned)
-
-
-_LEVELS = np.arange(256) / 255.0
 
 
 def ambience_of(frame: Frame, axes_world: Float64) -> Ambience:
@@ -125,30 +105,6 @@ def airlight_from_sky(sky: Float64) -> Float64:
     )
 
 
-def tone(overcast: float) -> tuple[Float64, Float64]:
-    """How an overcast sky changes recorded colours.
-
-    Contrast falls by a quarter about middle grey, saturation by a third, the white turns from 6500 K
-    to about 7200 K; the auto-exposure hides most of the lost light.
-
-    Args:
-        overcast: In [0, 1]; 0 changes nothing.
-
-    Returns:
-        Linear light (256,) of each sRGB level after the change of contrast and exposure, and the
-        colour matrix (3, 3) to apply after it.
-    """
-    light = linear_from_srgb(_LEVELS)
-    contrast = 1.0 - 0.25 * overcast
-    gain = 1.0 - 0.15 * overcast * (1.0 - 0.8)
-    curve = gain * MIDDLE_GREY * (light / MIDDLE_GREY) ** contrast if overcast else light
-    saturation = 1.0 - 0.35 * overcast
-    grey = np.broadcast_to(LUMINANCE, (3, 3))
-    white = 1.0 + overcast * (np.array([0.96, 1.00, 1.05]) - 1.0)
-    matrix = white[:, None] * (saturation * np.eye(3) + (1.0 - saturation) * grey)
-    return np.minimum(curve, 1.0), matrix
-
-
 def rain_colour(ambience: Ambience) -> Float64:
     """Linear colour of a drop: an inverted view of 165 degrees of its surroundings.
 
@@ -164,9 +120,3 @@ def snow_colour(ambience: Ambience) -> Float64:
     """Linear colour of a flake: diffuse, lit from above and below, never brighter than the sky."""
     diffuse = 0.9 * 0.5 * (ambience.sky + ambience.ground)
     return np.minimum(diffuse, 0.98 * ambience.sky)
-
-
-def encode_table() -> NDArray[np.uint8]:
-    """(4096,) sRGB level of linear light k / 4095."""
-    light = np.arange(ENCODE_LEVELS) / (ENCODE_LEVELS - 1)
-    return np.round(255 * srgb_from_linear(light)).astype(np.uint8)

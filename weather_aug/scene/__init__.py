@@ -1,0 +1,1 @@
+"""All of it, precomputed for one clip."""

@@ -1,0 +1,1 @@
+"""Weather on the fly: datasets and the transforms of host libraries."""

@@ -1,0 +1,1 @@
+"""Weather to the eye: sheets and sweeps."""

@@ -1,0 +1,1 @@
+"""Weather to disk: offline data sets."""

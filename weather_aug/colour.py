@@ -1,0 +1,37 @@
+"""sRGB and linear light; the one owner of the conversion."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Rec. 709 weights of linear RGB."""
+ENCODE_LEVELS = 4096
+
+
+def linear_from_srgb(value: Float64) -> Float64:
+    """Linear light in [0, 1] of an sRGB value in [0, 1] (IEC 61966-2-1)."""
+    value = np.asarray(value, np.float64)
+    linear: Float64 = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    return linear
+
+
+def srgb_from_linear(value: Float64) -> Float64:
+    """Encode linear light in [0, 1] as an sRGB value in [0, 1] (IEC 61966-2-1)."""
+    value = np.asarray(value, np.float64)
+    low, high = value * 12.92, 1.055 * np.maximum(value, 1e-12) ** (1 / 2.4) - 0.055
+    srgb: Float64 = np.where(value <= 0.0031308, low, high)
+    return srgb
+
+
+SRGB_LEVELS_LINEAR = linear_from_srgb(np.arange(256) / 255.0)
+"""(256,) linear light of each 8-bit sRGB level."""
+
+
+def encode_table() -> NDArray[np.uint8]:
+    """(4096,) sRGB level of linear light k / 4095."""
+    light = np.arange(ENCODE_LEVELS) / (ENCODE_LEVELS - 1)
+    return np.round(255 * srgb_from_linear(light)).astype(np.uint8)

@@ -1,0 +1,1 @@
+"""The editor that needs no weights."""

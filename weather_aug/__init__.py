@@ -1,0 +1,52 @@
+"""Rain, snow and fog for driving images, with physical severity and honest labels.
+
+Names are loaded on first use, so that importing the package costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "Weather": "weather_aug.weather",
+    "Camera": "weather_aug.clip.types",
+    "Clip": "weather_aug.clip.types",
+    "Frame": "weather_aug.clip.types",
+    "FrameKey": "weather_aug.clip.types",
+    "open_clip": "weather_aug.clip.open",
+    "RenderOptions": "weather_aug.render.compose",
+    "RenderedFrame": "weather_aug.render.compose",
+    "WeatherScene": "weather_aug.scene.scene",
+    "WeatherPolicy": "weather_aug.scene.policy",
+    "WeatherDataset": "weather_aug.transforms.dataset",
+    "WeatherAugError": "weather_aug.errors",
+}
+
+__all__ = [*sorted(_HOMES), "__version__"]
+
+if TYPE_CHECKING:
+    from weather_aug.clip.open import open_clip as open_clip
+    from weather_aug.clip.types import Camera as Camera
+    from weather_aug.clip.types import Clip as Clip
+    from weather_aug.clip.types import Frame as Frame
+    from weather_aug.clip.types import FrameKey as FrameKey
+    from weather_aug.errors import WeatherAugError as WeatherAugError
+    from weather_aug.render.compose import RenderedFrame as RenderedFrame
+    from weather_aug.render.compose import RenderOptions as RenderOptions
+    from weather_aug.scene.policy import WeatherPolicy as WeatherPolicy
+    from weather_aug.scene.scene import WeatherScene as WeatherScene
+    from weather_aug.transforms.dataset import WeatherDataset as WeatherDataset
+    from weather_aug.weather import Weather as Weather
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'weather_aug' has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

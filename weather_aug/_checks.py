@@ -1,4 +1,4 @@
-"""Checks of arguments at the edge of the library: right, or a typed error that names the argument."""
+"""Checks of arguments at the edge: right, or a typed error that names the argument."""
 
 from __future__ import annotations
 

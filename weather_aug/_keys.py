@@ -2,7 +2,7 @@
 
 A key is a 128-bit BLAKE2b hash of a domain and fixed-width fields; the numbers behind it come from
 a counter-based generator (Philox). The maps from 64-bit words to uniforms are ours, because numpy
-guarantees the words of a bit generator across versions, but not the numbers of `Generator` (NEP 19).
+guarantees the words of a bit generator across versions, not the numbers of `Generator` (NEP 19).
 """
 
 from __future__ import annotations

@@ -1,0 +1,212 @@
+"""Precompute a clip into a scene folder; interrupted work is taken up where it stopped."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weather_aug import _files
+from weather_aug.clip.types import Clip, Frame
+from weather_aug.errors import (
+    ArgumentError,
+    ClipError,
+    ConflictError,
+    DataError,
+    OutputError,
+    printable,
+)
+from weather_aug.render.light import ambience_of
+from weather_aug.scene import store
+from weather_aug.scene.policy import TYPES
+
+EDITORS = ("physical",)
+JOURNAL = "journal.jsonl"
+UNFINISHED_SUFFIX = ".building"
+
+Float64 = NDArray[np.float64]
+
+
+def build(
+    clip: Clip,
+    out: Path,
+    editor: str,
+    weathers: Sequence[str],
+    *,
+    progress: bool,
+    overwrite: bool,
+) -> None:
+    """Write the scene of `clip` to the folder `out`, which appears only when it is complete.
+
+    Work in progress stands in `out` + ".building" with a journal of finished frames; the same call
+    again continues it. Bad input removes it: there is nothing to continue.
+
+    Args:
+        clip: The drive; every frame needs depth.
+        out: Folder to make.
+        editor: How backgrounds get their weather; "physical" does it while rendering.
+        weathers: Types the scene is meant for.
+        progress: Show a bar.
+        overwrite: Replace `out` if it is a scene already.
+
+    Raises:
+        ArgumentError: If the editor or a weather is unknown.
+        ConflictError: If `out` exists.
+        ClipError: If the clip is empty or a frame has no depth.
+        OutputError: If the output cannot be written.
+    """
+    _check(clip, out, editor, weathers, overwrite)
+    work = out.with_name(out.name + UNFINISHED_SUFFIX)
+    try:
+        with _files.reported(work):
+            (work / store.FRAMES).mkdir(parents=True, exist_ok=True)
+        entries, files = _write_frames(clip, work, _fingerprint(clip), progress)
+    except DataError:
+        shutil.rmtree(work, ignore_errors=True)
+        raise
+    content = {
+        "name": store.check_name("clip name", clip.name),
+        "editor": editor,
+        "weathers": list(weathers),
+        "axes_world": street_axes(entries, clip.up_world).tolist(),
+        "airlight": np.median([entry.pop("airlight") for entry in entries], axis=0).tolist(),
+        "frames": entries,
+        "files": files,
+    }
+    _files.write_whole(work / store.MANIFEST, store.manifest_bytes(content))
+    with _files.reported(out):
+        (work / JOURNAL).unlink(missing_ok=True)
+        if overwrite and out.exists():
+            shutil.rmtree(out)
+        work.replace(out)
+        _files.sync_folder(out.parent)
+
+
+def street_axes(entries: Sequence[dict[str, Any]], up_world: Float64) -> Float64:
+    """Axes of the street (3, 3): rows along the first heading, to the left, up.
+
+    The heading is the way the rig went; of a rig that stood, the first camera's view.
+    """
+    up = np.asarray(up_world, np.float64)
+    up = up / np.linalg.norm(up)
+    first = np.array(entries[0]["world_from_camera"])
+    same = [e for e in entries if e["camera"] == entries[0]["camera"]]
+    way = np.array(same[-1]["world_from_camera"])[:3, 3] - first[:3, 3]
+    way -= (way @ up) * up
+    if np.linalg.norm(way) < 1.0:
+        way = first[:3, 2] - (first[:3, 2] @ up) * up
+    if np.linalg.norm(way) < 1e-6:
+        raise ClipError("the first camera looks straight up or down; the street has no heading")
+    along = way / np.linalg.norm(way)
+    return np.stack([along, np.cross(up, along), up])
+
+
+def _check(clip: Clip, out: Path, editor: str, weathers: Sequence[str], overwrite: bool) -> None:
+    if editor not in EDITORS:
+        raise ArgumentError(f"editor {printable(editor)!r} is not one of {', '.join(EDITORS)}")
+    unknown = sorted(set(weathers) - set(TYPES))
+    if unknown:
+        raise ArgumentError(f"weather {printable(unknown[0])!r} is not one of {', '.join(TYPES)}")
+    if not clip.keys:
+        raise ClipError(f"clip {clip.name} has no frames; there is nothing to build")
+    for camera in clip.cameras:
+        store.check_name("camera name", camera)
+    if out.exists() and not (overwrite and (out / store.MANIFEST).is_file()):
+        raise ConflictError(
+            f"{printable(out, 200)} exists; choose another folder, or pass overwrite to replace a "
+            "scene"
+        )
+    if not out.absolute().parent.is_dir():
+        raise OutputError(f"the folder {printable(out.absolute().parent, 200)} does not exist")
+
+
+def _fingerprint(clip: Clip) -> str:
+    """What must be equal for interrupted work to be continued."""
+    head = {"version": store.VERSION, "clip": repr(clip), "keys": [str(key) for key in clip.keys]}
+    return _files.sha256_of(json.dumps(head).encode())
+
+
+def _write_frames(
+    clip: Clip, work: Path, fingerprint: str, progress: bool
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Write all frames; entries for the manifest in the clip's order, and each file's digest."""
+    from tqdm.auto import tqdm
+
+    done = _read_journal(work, fingerprint)
+    start_s = None
+    with _files.reported(work), (work / JOURNAL).open("a", encoding="utf-8") as journal:
+        if not done:
+            journal.write(json.dumps({"fingerprint": fingerprint}) + "\n")
+        for key in tqdm(clip.keys, desc="build", unit="frame", disable=not progress):
+            if str(key) not in done:
+                frame = clip.frame(key)
+                done[str(key)] = _write_frame(work, frame, clip.up_world)
+                journal.write(json.dumps({"key": str(key), **done[str(key)]}) + "\n")
+                journal.flush()
+    entries: list[dict[str, Any]] = []
+    files: dict[str, Any] = {}
+    for key in clip.keys:
+        entry = done[str(key)]["entry"]
+        # Times of day lose the precision that motion needs; a clip starts at 0.
+        start_s = entry["time_s"] if start_s is None else start_s
+        entries.append(entry | {"time_s": entry["time_s"] - start_s})
+        files |= done[str(key)]["files"]
+    return entries, files
+
+
+def _write_frame(work: Path, frame: Frame, up_world: Float64) -> dict[str, Any]:
+    if frame.depth_m is None:
+        raise ClipError(
+            f"frame {frame.key} has no depth and no label to take a geometric prior from; give the "
+            "clip a depth folder or labels"
+        )
+    axes = np.zeros((3, 3))
+    axes[2] = up_world
+    ambience = ambience_of(frame, axes)
+    files = {}
+    for part, data in store.encode_frame(frame).items():
+        relative = store.part_path(frame.key, part)
+        _files.write_whole(work / relative, data)
+        files[relative] = {"size": len(data), "sha256": _files.sha256_of(data)}
+    entry = store.frame_record(frame, ambience) | {"airlight": ambience.airlight.tolist()}
+    return {"entry": entry, "files": files}
+
+
+def _read_journal(work: Path, fingerprint: str) -> dict[str, dict[str, Any]]:
+    """Frames that interrupted work has finished, by key, each verified by its digests."""
+    path = work / JOURNAL
+    if not path.exists():
+        return {}
+    records = _readable_prefix(path.read_text(encoding="utf-8", errors="replace").splitlines())
+    if not records or records[0].get("fingerprint") != fingerprint:
+        path.unlink()
+        return {}
+    done = {}
+    for record in records[1:]:
+        whole = all(
+            (work / relative).is_file()
+            and _files.sha256_of_file(work / relative) == entry["sha256"]
+            for relative, entry in record["files"].items()
+        )
+        if whole:
+            done[record["key"]] = {"entry": record["entry"], "files": record["files"]}
+    body = [json.dumps({"fingerprint": fingerprint})]
+    body += [json.dumps({"key": key, **value}) for key, value in done.items()]
+    _files.write_whole(path, ("\n".join(body) + "\n").encode())
+    return done
+
+
+def _readable_prefix(lines: list[str]) -> list[dict[str, Any]]:
+    """The journal's lines before the one that a crash cut."""
+    records = []
+    for line in lines:
+        try:
+            records.append(json.loads(line))
+        except ValueError:
+            break
+    return records

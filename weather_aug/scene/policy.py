@@ -1,0 +1,132 @@
+"""WeatherPolicy: which weather a sample gets, as a function of (seed, epoch, item) alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from weather_aug._checks import finite
+from weather_aug._keys import key_of, uniforms
+from weather_aug.errors import ArgumentError, printable
+from weather_aug.weather import Weather, parse_severity
+
+TYPES = ("clear", "rain", "snow", "fog")
+_FIELDS = ("types", "severity", "falling")
+
+
+@dataclass(frozen=True)
+class WeatherDraw:
+    """One sample's weather: a value that can be logged and rendered again."""
+
+    weather: Weather
+    seed: int
+    """Of the particles."""
+    kind: str
+    """Name of the type drawn, as in the policy."""
+    severity: float
+
+
+@dataclass(frozen=True)
+class WeatherPolicy:
+    """How often which weather is drawn, and how severe.
+
+    Convention:
+        A draw is a pure function of (seed, epoch, item): no worker, order or earlier draw changes
+        it. Types are weighted; a name with "+" (such as "rain+fog") is both at once. Severity is
+        uniform in its range; the wind blows from any side with equal chance. Of the draws of rain
+        and snow a share `falling` falls; the others show only what it leaves behind.
+
+    Raises:
+        ArgumentError: If a type is unknown, a weight negative, or a range outside [0, 1].
+    """
+
+    types: Mapping[str, float] = field(
+        default_factory=lambda: {"clear": 1.0, "rain": 2.0, "snow": 2.0, "fog": 1.0}
+    )
+    """Weight of each type; they need not sum to 1."""
+    severity: tuple[float, float] = (0.1, 1.0)
+    falling: float = 0.8
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.types, Mapping) or not self.types:
+            raise ArgumentError("types must map at least one weather type to its weight")
+        for name, weight in self.types.items():
+            unknown = [part for part in str(name).split("+") if part not in TYPES]
+            if unknown:
+                raise ArgumentError(
+                    f"weather type {printable(unknown[0])!r} is not one of {', '.join(TYPES)}"
+                )
+            finite(f"weight of {name}", weight, 0)
+        if sum(self.types.values()) <= 0:
+            raise ArgumentError("the weights of types must sum to more than 0")
+        try:
+            low, high = (parse_severity(s) for s in self.severity)
+        except (TypeError, ValueError) as error:
+            raise ArgumentError(
+                f"severity must be a range (low, high) in [0, 1]: {error}"
+            ) from None
+        if low > high:
+            raise ArgumentError(f"severity must be a range (low, high), got {self.severity}")
+        finite("falling", self.falling, 0, 1)
+        object.__setattr__(self, "types", dict(self.types))
+        object.__setattr__(self, "severity", (low, high))
+
+    def draw(self, seed: int, epoch: int, item: int) -> WeatherDraw:
+        """The weather of one item of one epoch."""
+        key = key_of("weather-draw", seed, epoch, item)
+        which, how, falls, direction, particles = uniforms(key, 5)
+        kind = self._kind(which)
+        severity = self.severity[0] + (self.severity[1] - self.severity[0]) * float(how)
+        falling = float(falls) < self.falling
+        weather = Weather.clear()
+        for part in kind.split("+"):
+            weather = Weather.mix(weather, weather_of(part, severity, falling=falling))
+        speed = math.hypot(*weather.wind_m_per_s)
+        angle = 2 * math.pi * float(direction)
+        wind = (speed * math.cos(angle), speed * math.sin(angle), 0.0)
+        return WeatherDraw(
+            replace(weather, wind_m_per_s=wind), int(particles * 2**53), kind, severity
+        )
+
+    def _kind(self, uniform: float) -> str:
+        left = uniform * sum(self.types.values())
+        for name, weight in self.types.items():
+            left -= weight
+            if left < 0:
+                return name
+        return next(name for name, weight in reversed([*self.types.items()]) if weight > 0)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Fields as JSON values."""
+        return {"types": dict(self.types), "severity": list(self.severity), "falling": self.falling}
+
+    @classmethod
+    def from_dict(cls, state: dict[str, Any]) -> WeatherPolicy:
+        """The inverse of `to_dict`; unknown fields are refused."""
+        unknown = sorted(set(state) - set(_FIELDS))
+        if unknown:
+            raise ArgumentError(
+                f"WeatherPolicy has no field {printable(unknown[0])}; it has {', '.join(_FIELDS)}"
+            )
+        if "severity" in state:
+            state = state | {"severity": tuple(state["severity"])}
+        return cls(**state)
+
+
+def weather_of(kind: str, severity: float | str, *, falling: bool = True) -> Weather:
+    """The Weather of a type's name and a severity.
+
+    Raises:
+        ArgumentError: If the type or the severity is unknown.
+    """
+    if kind == "clear":
+        return Weather.clear()
+    if kind == "rain":
+        return Weather.rain(severity, falling=falling)
+    if kind == "snow":
+        return Weather.snow(severity, falling=falling)
+    if kind == "fog":
+        return Weather.fog(severity)
+    raise ArgumentError(f"weather type {printable(kind)!r} is not one of {', '.join(TYPES)}")

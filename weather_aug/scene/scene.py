@@ -1,0 +1,160 @@
+"""WeatherScene: a precomputed clip that renders any weather of any of its frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from weather_aug.clip.types import Clip, Frame, FrameKey
+from weather_aug.errors import ArgumentError, IntegrityError, printable
+from weather_aug.particles.field import Window
+from weather_aug.render.compose import DEFAULT_OPTIONS, RenderedFrame, RenderOptions, render
+from weather_aug.render.light import Ambience
+from weather_aug.scene import store
+
+if TYPE_CHECKING:
+    from weather_aug.weather import Weather
+
+
+class WeatherScene:
+    """A clip precomputed for weather: pictures, depth, labels, cameras and light on disk.
+
+    Convention:
+        A scene is immutable and holds only its folder's path: it opens lazily, and pickles to a
+        worker as the path. Pictures are decoded per call; depth and labels are memory-mapped, which
+        trusts the storage not to shrink a file while it is open. Rendering is a pure function of
+        (scene, key, weather, seed, window, options).
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Use `WeatherScene.load` or `WeatherScene.build`."""
+        self.path = path
+
+    @classmethod
+    def load(cls, path: str | Path, *, verify: bool = False) -> WeatherScene:
+        """Open a scene folder.
+
+        Args:
+            path: Folder that `build` wrote.
+            verify: Read every file and compare digests, not only sizes.
+
+        Raises:
+            SceneError: If the folder is not a scene this version reads.
+            IntegrityError: If a file is missing, has another size or (verify) other bytes.
+        """
+        scene = cls(Path(path).absolute())
+        problems = store.damaged_files(scene.path, scene.manifest) if verify else []
+        if problems:
+            raise IntegrityError("; ".join(problems[:3]))
+        scene.manifest  # noqa: B018 - a scene that cannot be used says so when it is opened
+        return scene
+
+    @classmethod
+    def build(
+        cls,
+        clip: Clip,
+        out: str | Path,
+        *,
+        editor: str = "physical",
+        weathers: Sequence[str] = ("rain", "snow", "fog"),
+        progress: bool = False,
+        overwrite: bool = False,
+    ) -> WeatherScene:
+        """Precompute `clip` into the folder `out`; see `weather_aug.scene.build.build`."""
+        from weather_aug.scene.build import build
+
+        build(clip, Path(out), editor, weathers, progress=progress, overwrite=overwrite)
+        return cls.load(out)
+
+    @cached_property
+    def manifest(self) -> store.Manifest:
+        """The table of contents, read on first use."""
+        return store.read_manifest(self.path)
+
+    @property
+    def name(self) -> str:
+        """Name of the clip."""
+        return self.manifest.name
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 that names the scene's content."""
+        return self.manifest.digest
+
+    @property
+    def keys(self) -> tuple[FrameKey, ...]:
+        """Keys of all frames, by time, then camera."""
+        return tuple(record.key for record in self.manifest.frames)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras."""
+        return tuple(dict.fromkeys(record.key.camera for record in self.manifest.frames))
+
+    def frame(self, key: FrameKey) -> Frame:
+        """The recorded frame with its depth and label.
+
+        Raises:
+            ArgumentError: If the scene has no such frame.
+        """
+        return store.read_frame(self.path, self._record(key))
+
+    def ambience(self, key: FrameKey) -> Ambience:
+        """Light around a frame; the airlight and the axes are the clip's."""
+        light = {name: np.asarray(value) for name, value in self._record(key).light.items()}
+        return Ambience(self.manifest.axes_world, **light, airlight=self.manifest.airlight)
+
+    def render(
+        self,
+        key: FrameKey,
+        weather: Weather,
+        *,
+        seed: int = 0,
+        window: Window | None = None,
+        options: RenderOptions = DEFAULT_OPTIONS,
+    ) -> RenderedFrame:
+        """Render one frame in a weather; see `weather_aug.render.compose.render`.
+
+        Args:
+            key: Which frame, one of `keys`.
+            weather: State of air and ground.
+            seed: Which particles fall.
+            window: (top, left, height, width); the whole picture if None.
+            options: Budget.
+        """
+        return render(
+            self.frame(key),
+            weather,
+            seed=seed,
+            ambience=self.ambience(key),
+            window=window,
+            options=options,
+        )
+
+    def damaged_files(self) -> list[str]:
+        """Compare every file with its digest; one sentence for each that has changed."""
+        return store.damaged_files(self.path, self.manifest)
+
+    def size_of(self, key: FrameKey) -> tuple[int, int]:
+        """(height, width) of a frame, pixels, without reading it."""
+        camera = self._record(key).camera
+        return camera.height, camera.width
+
+    def _record(self, key: FrameKey) -> store.FrameRecord:
+        record = self.manifest.by_key.get(FrameKey(*key))
+        if record is None:
+            raise ArgumentError(
+                f"scene {self.name} has no frame {printable(key)}; it has {len(self.keys)} frames "
+                f"of cameras {', '.join(self.cameras)}"
+            )
+        return record
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (WeatherScene, (self.path,))
+
+    def __repr__(self) -> str:
+        return f"WeatherScene({str(self.path)!r})"

@@ -1,0 +1,104 @@
+"""Where the sky is in an unlabelled daylight picture: a heuristic, used for depth only."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+WORKING_WIDTH_PX = 640
+MIN_BRIGHTNESS = 130
+MIN_BLUE_BRIGHTNESS = 80
+MAX_TEXTURE = 5.0
+MIN_SHARE = 0.002
+GAP_SHARE = 0.03
+GAP_GREY_LEVELS = 18
+BRIDGE_PX = 9
+DULL_SHARE = 0.75
+DEEP_BLUE = 30
+
+
+def sky_mask(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Pixels that look like sky: bright and grey or blue, smooth, connected to the top border.
+
+    White walls that touch the top of the picture are taken for sky, night sky is not found; give
+    labels, or measurements that contradict it, where that matters. Gaps in foliage count as sky
+    where they have the brightness of the sky nearby.
+
+    Args:
+        image: (H, W, 3) uint8 RGB.
+
+    Returns:
+        (H, W) bool.
+    """
+    height, width = image.shape[:2]
+    scale = min(1.0, WORKING_WIDTH_PX / width)
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    coloured = _sky_coloured(small)
+    open_sky = _touching_top(coloured & (texture(small) < MAX_TEXTURE))
+    open_sky = _touching_top(open_sky & ~_dull(small, open_sky))
+    if open_sky.mean() < MIN_SHARE:
+        return np.zeros((height, width), bool)
+    mask = open_sky | _gaps(small, open_sky)
+    mask = mask | _rim(small, mask)
+    grown = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(grown > 0.5)
+
+
+def _sky_coloured(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    red, green, blue = (image[..., channel].astype(np.int16) for channel in range(3))
+    brightness = np.maximum(np.maximum(red, green), blue)
+    greyness = brightness - np.minimum(np.minimum(red, green), blue)
+    bright = (brightness >= MIN_BRIGHTNESS) & (greyness <= 0.18 * brightness)
+    blueish = (brightness >= MIN_BLUE_BRIGHTNESS) & (blue >= green) & (green >= red - 4)
+    return np.asarray(bright | (blueish & (blue > red + 8)))
+
+
+def texture(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Standard deviation of the grey value within 5x5 pixels, (H, W)."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    mean = cv2.blur(grey, (5, 5))
+    variance = cv2.blur(grey * grey, (5, 5)) - mean * mean
+    return np.sqrt(np.maximum(variance, 0)).astype(np.float32)
+
+
+def _touching_top(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    # Wires cut the sky into pieces; a piece belongs to it if only a few pixels lie between.
+    bridged = cv2.dilate(mask.astype(np.uint8), np.ones((BRIDGE_PX, BRIDGE_PX), np.uint8))
+    _, parts = cv2.connectedComponents(bridged, connectivity=4)
+    at_top = np.unique(parts[:2][mask[:2]])
+    return np.isin(parts, at_top) & mask
+
+
+def _dull(image: NDArray[np.uint8], sky: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Grey pixels well below the brightest tenth of the sky: the side of a white lorry."""
+    if not sky.any():
+        return np.zeros_like(sky)
+    brightness = image.max(axis=2)
+    blueish = image[..., 2] > image[..., 0].astype(np.int16) + DEEP_BLUE
+    return np.asarray((brightness < DULL_SHARE * np.percentile(brightness[sky], 90)) & ~blueish)
+
+
+def _local_mean(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Mean colour of the masked pixels around each pixel, (H, W, 3); -255 where there are none."""
+    side = 2 * max(3, round(GAP_SHARE * image.shape[1])) + 1
+    share = cv2.blur(mask.astype(np.float32), (side, side))
+    total = cv2.blur(image.astype(np.float32) * mask[..., None], (side, side))
+    mean = total / np.maximum(share, 1e-6)[..., None]
+    return np.where((share > 1e-4)[..., None], mean, -255).astype(np.float32)
+
+
+def _gaps(image: NDArray[np.uint8], sky: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels near the open sky that have its colour, such as holes in foliage."""
+    off = np.abs(image.astype(np.float32) - _local_mean(image, sky)).max(axis=2)
+    return np.asarray(off < GAP_GREY_LEVELS)
+
+
+def _rim(image: NDArray[np.uint8], sky: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The blurred pixels at the border, given to the side whose colour they are closer to."""
+    kernel = np.ones((5, 5), np.uint8)
+    ring = (cv2.dilate(sky.astype(np.uint8), kernel) > 0) & ~sky
+    to_sky = np.abs(image.astype(np.float32) - _local_mean(image, sky)).max(axis=2)
+    to_land = np.abs(image.astype(np.float32) - _local_mean(image, ~sky)).max(axis=2)
+    return np.asarray(ring & (to_sky < 0.7 * to_land))

@@ -1,0 +1,178 @@
+"""Depth from a rectified stereo pair: semi-global matching, checked both ways and completed."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from weather_aug._checks import finite, image_uint8, like_image
+from weather_aug.clip.completion import completed, sharpened
+from weather_aug.clip.sky import sky_mask, texture
+from weather_aug.errors import ArgumentError
+from weather_aug.taxonomy import SKY
+
+Float32 = NDArray[np.float32]
+
+MATCH_SIDE_PX = 3
+CHECK_PX = 1.0
+SPECKLE_PX = 120
+HIDDEN_CONFIDENCE = 0.02
+MIN_DISPARITY_PX = 0.4
+MIN_DEPTH_M = 2.5
+MIN_TEXTURE = 6.0
+
+
+class Disparity(NamedTuple):
+    """Disparity of one view of a stereo pair."""
+
+    disparity_px: Float32
+    """(H, W); 0 where nothing was matched."""
+    trusted: NDArray[np.bool_]
+    """(H, W); matched, and the other view agrees to CHECK_PX."""
+
+
+def stereo_depth(
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    *,
+    focal_px: float,
+    baseline_m: float,
+    label: NDArray[np.uint8] | None = None,
+) -> Float32:
+    """Dense z-depth of the left picture of a rectified pair.
+
+    For the right picture's depth mirror both and swap them: `right_depth`.
+
+    Args:
+        left: (H, W, 3) uint8 RGB.
+        right: (H, W, 3) uint8 RGB, rows aligned with `left`.
+        focal_px: Focal length of both, pixels.
+        baseline_m: Distance between the camera centres, metres.
+        label: (H, W) train ids of the left picture for its sky, or None to find the sky by
+            `sky_mask`.
+
+    Returns:
+        (H, W) float32 metres, above 0, `inf` in the sky.
+
+    Raises:
+        ArgumentError: If the pictures differ in size or a number is out of range.
+    """
+    left, right = image_uint8("left", left), image_uint8("right", right)
+    like_image("right", right[..., 0], left.shape[:2])
+    finite("focal_px", focal_px, 1.0)
+    finite("baseline_m", baseline_m, 1e-3)
+    reach_px = focal_px * baseline_m / MIN_DEPTH_M
+    match = disparity(left, right, max_disparity_px=reach_px)
+    if not match.trusted.any():
+        raise ArgumentError("left and right have nothing in common; are they one moment's pair?")
+    if label is None:
+        # White walls look like sky; matches nearer than 100 m say otherwise, but only where there
+        # is something to match: empty sky gives consistent nonsense.
+        near = match.trusted & (match.disparity_px > focal_px * baseline_m / 100.0)
+        sky = sky_mask(left) & ~_dense(near & (texture(left) > MIN_TEXTURE))
+    else:
+        like_image("label", label, left.shape[:2])
+        sky = label == SKY
+    trusted = match.trusted & ~sky
+    values = np.where(trusted, match.disparity_px, _from_background(match.disparity_px, trusted))
+    confidence = np.where(trusted, 1.0, HIDDEN_CONFIDENCE).astype(np.float32)
+    confidence[sky | (values <= 0)] = 0
+    smooth = completed(values, confidence, left, barrier=sky, stiffness=4.0)
+    sharp = sharpened(smooth, min_jump=1.5)
+    depth = focal_px * baseline_m / np.maximum(sharp, MIN_DISPARITY_PX)
+    return np.where(sky, np.inf, depth).astype(np.float32)
+
+
+def right_depth(
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    *,
+    focal_px: float,
+    baseline_m: float,
+    label: NDArray[np.uint8] | None = None,
+) -> Float32:
+    """Dense z-depth of the right picture; arguments and result as in `stereo_depth`."""
+    mirrored_label = None if label is None else np.ascontiguousarray(label[:, ::-1])
+    depth = stereo_depth(
+        np.ascontiguousarray(right[:, ::-1]),
+        np.ascontiguousarray(left[:, ::-1]),
+        focal_px=focal_px,
+        baseline_m=baseline_m,
+        label=mirrored_label,
+    )
+    return np.ascontiguousarray(depth[:, ::-1])
+
+
+def disparity(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], *, max_disparity_px: float
+) -> Disparity:
+    """Left disparity by semi-global matching, trusted where the right view agrees.
+
+    Source: Hirschmueller 2008, "Stereo processing by semiglobal matching and mutual information"
+    (OpenCV's variant with Birchfield-Tomasi cost).
+    """
+    count = int(np.ceil(max(max_disparity_px, 16) / 16)) * 16
+    left_px = _matched(left, right, count)
+    right_px = _matched(left=right[:, ::-1], right=left[:, ::-1], count=count)[:, ::-1]
+    height, width = left_px.shape
+    columns = np.arange(width, dtype=np.float32) - left_px
+    rows = np.repeat(np.arange(height, dtype=np.float32)[:, None], width, axis=1)
+    there = cv2.remap(
+        np.ascontiguousarray(right_px), columns, rows, cv2.INTER_NEAREST, borderValue=-1e3
+    )
+    trusted = (left_px > 0) & (np.abs(left_px - there) <= CHECK_PX)
+    return Disparity(np.where(left_px > 0, left_px, 0).astype(np.float32), trusted)
+
+
+def _matched(left: NDArray[np.uint8], right: NDArray[np.uint8], count: int) -> Float32:
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=0,
+        numDisparities=count,
+        blockSize=MATCH_SIDE_PX,
+        P1=8 * 3 * MATCH_SIDE_PX**2,
+        P2=32 * 3 * MATCH_SIDE_PX**2,
+        preFilterCap=31,
+        uniquenessRatio=5,
+        speckleWindowSize=SPECKLE_PX,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )
+    # OpenCV leaves the first `count` columns unmatched; a margin moves them out of the picture.
+    wide = [
+        cv2.copyMakeBorder(np.ascontiguousarray(view), 0, 0, count, 0, cv2.BORDER_REPLICATE)
+        for view in (left, right)
+    ]
+    sixteenths = matcher.compute(*wide)[:, count:]
+    return sixteenths.astype(np.float32) / 16
+
+
+def _dense(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels whose surroundings are mostly masked, in a square or along a post."""
+    share = mask.astype(np.float32)
+    return np.asarray((cv2.blur(share, (9, 9)) > 0.5) | (cv2.blur(share, (3, 15)) > 0.6))
+
+
+@numba.njit(cache=True, nogil=True)
+def _from_background(disparity_px: Float32, trusted: NDArray[np.bool_]) -> Float32:
+    """Fill each untrusted run of a row with the smaller disparity of its two ends.
+
+    What one camera sees and the other does not is background, hidden behind the nearer surface.
+    """
+    height, width = disparity_px.shape
+    filled = np.zeros((height, width), np.float32)
+    for row in range(height):
+        start = 0
+        before = np.float32(0.0)
+        for column in range(width + 1):
+            if column < width and not trusted[row, column]:
+                continue
+            after = disparity_px[row, column] if column < width else np.float32(0.0)
+            value = min(before, after) if before > 0 and after > 0 else max(before, after)
+            for hidden in range(start, column):
+                filled[row, hidden] = value
+            before, start = after, column + 1
+    return filled

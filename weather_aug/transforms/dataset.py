@@ -1,0 +1,164 @@
+"""WeatherDataset: a torch Dataset that draws the weather of each sample on the fly."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset, get_worker_info
+
+from weather_aug._keys import check_seed, key_of, uniforms
+from weather_aug.errors import ArgumentError
+from weather_aug.particles.field import Window
+from weather_aug.render.compose import DEFAULT_OPTIONS, RenderedFrame, RenderOptions, warm_up
+from weather_aug.scene.policy import WeatherDraw, WeatherPolicy
+from weather_aug.scene.scene import WeatherScene
+
+Sample = dict[str, Any]
+
+
+class WeatherDataset(Dataset[Any]):
+    """Frames of scenes, each in a weather drawn for (seed, epoch, index).
+
+    Convention:
+        Item i of epoch e is the same bytes in any process, on any number of workers, in any order,
+        and another weather in another epoch. Call `set_epoch` between epochs; it reaches persistent
+        workers too. Without `transform` an item is a dict of tensors: `image` (3, H, W) uint8 RGB,
+        `label` (H, W) int64 train ids with 255 where the surface cannot be seen, `invalid` (H, W)
+        uint8, `transmittance` and `depth` (H, W) float32, and `recipe`, a JSON text from which the
+        item can be rendered again. Scenes without labels give items without `label`.
+
+    Args:
+        scenes: One or more scenes.
+        policy: Which weather how often.
+        seed: Of all draws.
+        transform: Called with the sample as numpy arrays (`image` (H, W, 3), `label` (H, W) uint8,
+            …); what it returns is the item.
+        crop: (height, width) of a random part to render; only that part is rendered.
+        options: Budget of the renderer.
+
+    Raises:
+        ArgumentError: If there are no scenes, or a frame is smaller than the crop.
+    """
+
+    def __init__(
+        self,
+        scenes: Sequence[WeatherScene],
+        policy: WeatherPolicy | None = None,
+        *,
+        seed: int = 0,
+        transform: Callable[[Sample], Any] | None = None,
+        crop: tuple[int, int] | None = None,
+        options: RenderOptions = DEFAULT_OPTIONS,
+    ) -> None:
+        self.scenes = tuple(scenes)
+        if not self.scenes:
+            raise ArgumentError("scenes is empty; build one with `weather-aug build`")
+        self.policy = policy or WeatherPolicy()
+        self.seed = check_seed("seed", seed)
+        self.transform = transform
+        self.crop = crop
+        self.options = options
+        self._ends = np.cumsum([len(scene.keys) for scene in self.scenes])
+        # Shared memory, because persistent workers hold a copy of everything else.
+        self._epoch = torch.zeros(1, dtype=torch.int64).share_memory_()
+        self._check_crop()
+        if get_worker_info() is None:
+            warm_up()
+
+    def __len__(self) -> int:
+        return int(self._ends[-1])
+
+    @property
+    def epoch(self) -> int:
+        """The epoch whose weather is drawn."""
+        return int(self._epoch)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Draw the weather of another epoch, in this process and in all workers."""
+        self._epoch[0] = check_seed("epoch", epoch)
+
+    def __getitem__(self, index: int) -> Any:
+        index = self._checked(index)
+        scene, key = self._locate(index)
+        draw = self.policy.draw(self.seed, self.epoch, index)
+        window = self._window(scene, key, index)
+        shot = scene.render(key, draw.weather, seed=draw.seed, window=window, options=self.options)
+        sample = _sample(shot, _recipe(scene, key, draw, window))
+        return _tensors(sample) if self.transform is None else self.transform(sample)
+
+    def _checked(self, index: int) -> int:
+        number = index.__index__()
+        if not -len(self) <= number < len(self):
+            raise IndexError(f"index {number} is outside a dataset of {len(self)} frames")
+        return number % len(self)
+
+    def _locate(self, index: int) -> tuple[WeatherScene, Any]:
+        which = int(np.searchsorted(self._ends, index, side="right"))
+        scene = self.scenes[which]
+        first = int(self._ends[which]) - len(scene.keys)
+        return scene, scene.keys[index - first]
+
+    def _window(self, scene: WeatherScene, key: Any, index: int) -> Window | None:
+        if self.crop is None:
+            return None
+        height, width = scene.size_of(key)
+        rows, columns = self.crop
+        down, right = uniforms(key_of("crop", self.seed, self.epoch, index), 2)
+        top = int(down * (height - rows + 1))
+        left = int(right * (width - columns + 1))
+        return (top, left, rows, columns)
+
+    def _check_crop(self) -> None:
+        if self.crop is None:
+            return
+        for scene in self.scenes:
+            for key in scene.keys:
+                height, width = scene.size_of(key)
+                if not (0 < self.crop[0] <= height and 0 < self.crop[1] <= width):
+                    raise ArgumentError(
+                        f"crop {self.crop} does not fit frame {key} of scene {scene.name} "
+                        f"({height}x{width} pixels)"
+                    )
+
+
+def _sample(shot: RenderedFrame, recipe: str) -> Sample:
+    sample: Sample = {
+        "image": shot.image,
+        "invalid": shot.invalid,
+        "transmittance": shot.transmittance,
+        "depth": shot.depth,
+        "recipe": recipe,
+    }
+    if shot.label is not None:
+        sample |= {"label": shot.label, "label_full": shot.label_full}
+    return sample
+
+
+def _tensors(sample: Sample) -> Sample:
+    tensors = {
+        name: torch.from_numpy(value) if isinstance(value, np.ndarray) else value
+        for name, value in sample.items()
+    }
+    tensors["image"] = tensors["image"].permute(2, 0, 1).contiguous()
+    for name in ("label", "label_full"):
+        if name in tensors:
+            tensors[name] = tensors[name].long()
+    return tensors
+
+
+def _recipe(scene: WeatherScene, key: Any, draw: WeatherDraw, window: Window | None) -> str:
+    return json.dumps(
+        {
+            "scene": scene.name,
+            "scene_digest": scene.digest,
+            "time_index": key.time_index,
+            "camera": key.camera,
+            "weather": draw.weather.to_dict(),
+            "seed": draw.seed,
+            "window": window,
+        }
+    )

@@ -1,0 +1,165 @@
+"""Sheets of labelled pictures: severity sweeps and contact sheets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from weather_aug import _files
+from weather_aug.clip.types import FrameKey
+from weather_aug.render.compose import RenderedFrame
+from weather_aug.scene.policy import weather_of
+from weather_aug.scene.scene import WeatherScene
+from weather_aug.taxonomy import coloured
+
+UInt8 = NDArray[np.uint8]
+
+KINDS = ("rain", "snow", "fog")
+SEVERITIES = ("light", "moderate", "heavy", "extreme")
+_MARGIN_PX = 4
+_HEADER_PX = 26
+_PAPER, _INK = 250, 30
+
+
+def sweep(
+    scene: WeatherScene,
+    key: FrameKey | None = None,
+    *,
+    kinds: Sequence[str] = KINDS,
+    severities: Sequence[str | float] = SEVERITIES,
+    seed: int = 0,
+    tile_width: int = 480,
+) -> UInt8:
+    """One labelled picture: a row per weather, a column per severity, the clear frame first.
+
+    Args:
+        scene: Scene to render from.
+        key: Which frame; the middle one if None.
+        kinds: Weather types.
+        severities: Names or numbers in [0, 1].
+        seed: Of the particles.
+        tile_width: Width of each picture, pixels.
+
+    Returns:
+        (H, W, 3) uint8.
+    """
+    key = key or scene.keys[len(scene.keys) // 2]
+    clear = scene.render(key, weather_of("clear", 0.0), seed=seed).image
+    rows = []
+    for kind in kinds:
+        shots = [scene.render(key, weather_of(kind, s), seed=seed).image for s in severities]
+        rows.append([clear, *shots])
+    return grid(rows, kinds, ["clear", *(str(s) for s in severities)], tile_width)
+
+
+def contact_sheet(
+    scene: WeatherScene,
+    keys: Sequence[FrameKey],
+    *,
+    severities: Sequence[str | float] = SEVERITIES[:3],
+    seed: int = 0,
+    tile_width: int = 320,
+) -> UInt8:
+    """Every weather and severity of some frames, with label and transmittance below each picture.
+
+    Args:
+        scene: Scene to render from.
+        keys: One block of rows for each.
+        severities: Names or numbers in [0, 1].
+        seed: Of the particles.
+        tile_width: Width of each picture, pixels.
+
+    Returns:
+        (H, W, 3) uint8.
+    """
+    states = [("clear", 0.0), *((kind, s) for kind in KINDS for s in severities)]
+    rows: list[list[UInt8]] = []
+    names: list[str] = []
+    for key in keys:
+        shots = [scene.render(key, weather_of(kind, s), seed=seed) for kind, s in states]
+        rows.append([shot.image for shot in shots])
+        names.append(key.camera)
+        if shots[0].label is not None:
+            rows.append([coloured(_label(shot)) for shot in shots])
+            names.append("label")
+        rows.append([transmittance_picture(shot.transmittance) for shot in shots])
+        names.append("transmittance")
+    columns = ["clear", *(f"{s} {kind}" for kind, s in states[1:])]
+    return grid(rows, names, columns, tile_width)
+
+
+def transmittance_picture(transmittance: NDArray[np.float32]) -> UInt8:
+    """Paint transmittance (H, W) in [0, 1] with a perceptually even colour map, (H, W, 3)."""
+    levels = np.round(255 * np.clip(transmittance, 0, 1)).astype(np.uint8)
+    painted: UInt8 = cv2.cvtColor(
+        cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB
+    )
+    return painted
+
+
+def grid(
+    rows: Sequence[Sequence[UInt8]],
+    row_names: Sequence[str],
+    column_names: Sequence[str],
+    tile_width: int,
+) -> UInt8:
+    """Rows of pictures on paper, each column with a heading, each row with its name.
+
+    Pictures are scaled to one width; a row is as high as its first picture.
+    """
+    tiles = [[_scaled(image, tile_width) for image in row] for row in rows]
+    columns = max(len(row) for row in tiles)
+    left = _HEADER_PX
+    width = left + columns * (tile_width + _MARGIN_PX)
+    height = _HEADER_PX + sum(row[0].shape[0] + _MARGIN_PX for row in tiles)
+    sheet = Image.new("RGB", (width, height), (_PAPER,) * 3)
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(size=16)
+    for column, name in enumerate(column_names):
+        draw.text((left + column * (tile_width + _MARGIN_PX), 4), name, fill=(_INK,) * 3, font=font)
+    y = _HEADER_PX
+    for row, name in zip(tiles, row_names, strict=True):
+        row_height = row[0].shape[0]
+        sheet.paste(_upright(name, row_height, font), (0, y))
+        for column, tile in enumerate(row):
+            sheet.paste(Image.fromarray(tile), (left + column * (tile_width + _MARGIN_PX), y))
+        y += row_height + _MARGIN_PX
+    return np.asarray(sheet)
+
+
+def write_png(path: Path, image: UInt8) -> None:
+    """Write a picture, whole or not at all; its folder is made.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    ok, png = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    assert ok, "an 8-bit RGB array always encodes"
+    with _files.reported(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    _files.write_whole(path, png.tobytes())
+
+
+def _label(shot: RenderedFrame) -> UInt8:
+    assert shot.label is not None
+    return shot.label
+
+
+def _scaled(image: UInt8, width: int) -> UInt8:
+    height = max(1, round(image.shape[0] * width / image.shape[1]))
+    way = cv2.INTER_AREA if width < image.shape[1] else cv2.INTER_LINEAR
+    scaled: UInt8 = cv2.resize(image, (width, height), interpolation=way)
+    return scaled
+
+
+def _upright(
+    text: str, height: int, font: ImageFont.FreeTypeFont | ImageFont.ImageFont
+) -> Image.Image:
+    strip = Image.new("RGB", (height, _HEADER_PX), (_PAPER,) * 3)
+    ImageDraw.Draw(strip).text((4, 4), text, fill=(_INK,) * 3, font=font)
+    return strip.rotate(90, expand=True)

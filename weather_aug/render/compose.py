@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -104,7 +105,7 @@ def render(
         return _clear(frame, window)
     outer = _with_margin(window, NEIGHBOURHOOD_PX // 2, height, width)
     image, label, depth = _cut(frame, outer)
-    sky = depth == np.inf if label is None else label == SKY
+    sky = _sky_by_depth(depth) if label is None else label == SKY
     fields = _fields(weather, seed, ambience)
     resolved = [field.resolve(frame.camera, options.max_particles) for field in fields]
     shot = _shade(frame, weather, ambience, outer, fields, resolved, image, depth, sky)
@@ -163,6 +164,18 @@ def _cut(frame: Frame, window: Window) -> tuple[UInt8, UInt8 | None, Float32]:
     if label is not None:
         depth[label == SKY] = np.inf
     return np.asarray(frame.image[part]), label, depth
+
+
+def _sky_by_depth(depth: Float32) -> NDArray[np.bool_]:
+    """Where the sky may show: everything far, and the ring around it that depth sensors miss.
+
+    Inside the mask only pixels as bright as the sky are taken for it, so that the ring costs
+    nothing where the edge was right.
+    """
+    size = (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX)
+    far = (depth == np.inf).astype(np.uint8)
+    ringed: NDArray[np.bool_] = cv2.dilate(far, np.ones(size, np.uint8)).astype(bool)
+    return ringed
 
 
 def _with_margin(window: Window, margin: int, height: int, width: int) -> Window:

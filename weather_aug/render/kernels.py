@@ -105,8 +105,8 @@ def project(particles, optics, medium, resolved_depth, colour, airlight, window,
 
     A disc of diameter D is a Gaussian of standard deviation D / (2 sqrt 2) and peak opacity 1
     (equal area). A uniform sweep q adds q q^T / 12, defocus of diameter c adds c^2 / 16, the pixel
-    filter 0.3 px^2; the peak falls by the square root of the ratio of determinants, so that the opacity
-    integrated over the picture is the silhouette's, whatever the resolution or exposure.
+    filter 0.3 px^2; the peak falls by the square root of the ratio of determinants, so that the
+    opacity integrated over the picture is the silhouette's, whatever the resolution or exposure.
 
     Args:
         particles: (N, 7) float32, as `ParticleField.particles` returns them.

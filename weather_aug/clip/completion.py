@@ -75,8 +75,8 @@ def edge_weights(
 def sharpened(inverse: Float32, *, min_jump: float, rounds: int = 4) -> Float32:
     """Turn the ramps at depth edges into steps, so that no surface hangs between two others.
 
-    Where inverse depth varies within 3x3 by more than `min_jump` (per metre) and by a tenth of its
-    value, each pixel takes the nearer of the two extremes (a shock filter).
+    Where inverse depth (or disparity) varies within 3x3 by more than `min_jump` and by a tenth of
+    its value, each pixel takes the nearer of the two extremes (a shock filter).
     """
     sharp = inverse
     kernel = np.ones((3, 3), np.uint8)
@@ -86,6 +86,15 @@ def sharpened(inverse: Float32, *, min_jump: float, rounds: int = 4) -> Float32:
         snapped = np.where(sharp - low < high - sharp, low, high)
         sharp = np.where(edge, snapped, sharp).astype(np.float32)
     return sharp
+
+
+def depth_jump(focal_px: float) -> float:
+    """Step of inverse depth (1/m) that is an edge and not ground.
+
+    Ground seen from height h changes by 1 / (f h) a row; within 3x3 that is twice, and seen from
+    1.3 m on an uphill road no more than this.
+    """
+    return 3.0 / focal_px
 
 
 def _weight(difference: Float32) -> Float32:

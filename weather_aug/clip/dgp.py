@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -159,10 +159,10 @@ def _scene_path(root: Path, scene: str | None) -> Path:
 def _shots(scene: Record, folder: Path) -> dict[tuple[int, str], _Shot]:
     """All pictures of a scene by (sample index in time, camera)."""
     data = {item["key"].text(): item for item in scene["data"]}
-    samples = sorted(scene["samples"], key=lambda sample: _seconds(sample["id"]["timestamp"]))
+    samples = sorted(scene["samples"], key=lambda sample: _microseconds(sample["id"]["timestamp"]))
     if not samples:
         raise scene["samples"].fault("is empty")
-    start = min(_seconds(item["id"]["timestamp"]) for item in data.values())
+    start = min(_microseconds(item["id"]["timestamp"]) for item in data.values())
     shots: dict[tuple[int, str], _Shot] = {}
     for index, sample in enumerate(samples):
         members = [_datum(key, data) for key in sample["datum_keys"]]
@@ -177,7 +177,7 @@ def _shots(scene: Record, folder: Path) -> dict[tuple[int, str], _Shot]:
                 raise member["id"]["name"].fault(f"{name!r} is not in the sample's calibration")
             camera = _camera(picture, intrinsics[name])
             path = inside(folder, picture["filename"].text(), picture["filename"].where)
-            time_s = _seconds(member["id"]["timestamp"]) - start
+            time_s = (_microseconds(member["id"]["timestamp"]) - start) / 1e6
             shots[index, name] = _Shot(path, time_s, camera, sweep)
     if not shots:
         raise scene["data"].fault("holds no picture")
@@ -229,8 +229,9 @@ def _intrinsics(folder: Path, key: Record) -> dict[str, Float64]:
 
 def _camera(picture: Record, intrinsics: Float64) -> Camera:
     width, height = picture["width"].integer(), picture["height"].integer()
+    world_from_camera = _pose(picture["pose"])
     try:
-        return Camera(intrinsics, _pose(picture["pose"]), width, height)
+        return Camera(intrinsics, world_from_camera, width, height)
     except CalibrationError as error:
         raise CalibrationError(f"{picture.where}: {error}") from None
 
@@ -257,18 +258,18 @@ def _pose(record: Record) -> Float64:
     return motion_from_quaternion(wxyz, xyz, record.where)
 
 
-def _seconds(record: Record) -> float:
-    """Unix time of a timestamp, to the microsecond."""
+def _microseconds(record: Record) -> float:
+    """Unix time of a timestamp, microseconds."""
     try:
         moment = datetime.fromisoformat(record.text())
     except ValueError:
         raise record.fault("is not a time (ISO 8601)") from None
     if moment.tzinfo is None:
         raise record.fault("has no time zone")
-    seconds = (moment - datetime(1970, 1, 1, tzinfo=UTC)).total_seconds()
+    unix = (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1)
     # The scenes published with DGP carry ten times the Unix time (they say 2464 for a drive of
     # 2019, whose files are named by the true time), which would slow the car down tenfold.
-    return seconds / 10 if moment.year >= _FIRST_IMPOSSIBLE_YEAR else seconds
+    return unix / 10 if moment.year >= _FIRST_IMPOSSIBLE_YEAR else float(unix)
 
 
 def _points_world(sweep: _Sweep) -> Float64:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug._checks import finite
-from weather_aug.clip.completion import completed, sharpened
+from weather_aug.clip.completion import completed, depth_jump, sharpened
 from weather_aug.clip.images import read_image, read_label, resized_image, resized_label
 from weather_aug.clip.prior import geometric_prior_depth
 from weather_aug.clip.records import (
@@ -246,7 +246,8 @@ def _whole_depth(
     sky = np.isinf(metres) | (unknown & looks_like_sky)
     inverse = np.where(known, 1 / np.where(known, metres, 1), 0).astype(np.float32)
     confidence = np.where(known, 100, 0).astype(np.float32)
-    filled = sharpened(completed(inverse, confidence, image, barrier=sky), min_jump=4e-3)
+    filled = completed(inverse, confidence, image, barrier=sky)
+    filled = sharpened(filled, min_jump=depth_jump(focal_px))
     depth = np.where(known, metres, 1 / np.clip(filled, 1 / MAX_DEPTH_M, 1 / MIN_DEPTH_M))
     return np.where(sky, np.inf, np.maximum(depth, MIN_DEPTH_M)).astype(np.float32)
 

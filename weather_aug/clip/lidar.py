@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug._checks import image_uint8, like_image
-from weather_aug.clip.completion import completed, sharpened
+from weather_aug.clip.completion import completed, depth_jump, sharpened
 from weather_aug.clip.sky import sky_mask
 from weather_aug.errors import ArgumentError
 from weather_aug.taxonomy import SKY
@@ -68,7 +68,7 @@ def lidar_depth(
     confidence = np.where(measured, HOLD, 0).astype(np.float32)
     confidence[measured & _at_jump(sparse, _line_px(intrinsics))] = HOLD_AT_JUMP
     smooth = completed(inverse, confidence, image, barrier=sky)
-    sharp = sharpened(smooth, min_jump=4e-3)
+    sharp = sharpened(smooth, min_jump=depth_jump(float(intrinsics[1, 1])))
     depth = 1 / np.clip(sharp, 1 / MAX_DEPTH_M, 1 / MIN_DEPTH_M)
     return np.where(sky, np.inf, depth).astype(np.float32)
 

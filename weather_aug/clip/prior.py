@@ -27,9 +27,10 @@ MIN_DEPTH_M = 0.5
 HUNG_HEIGHT_M = 2.8
 BEHIND_SHARE = 0.35
 
-_COMPACT = ("person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle", "pole")
+_COMPACT = ("person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle")
 _HUNG = ("traffic light", "traffic sign")
-_GROUND_KIND, _SKY_KIND, _WIDE_KIND, _COMPACT_KIND, _HUNG_KIND = range(5)
+# The kernels below test these numbers as literals: 2 and up stand or hang, 3 and up are compact.
+_GROUND_KIND, _SKY_KIND, _WIDE_KIND, _COMPACT_KIND, _POLE_KIND, _HUNG_KIND = range(6)
 
 
 def _kinds() -> NDArray[np.uint8]:
@@ -37,6 +38,7 @@ def _kinds() -> NDArray[np.uint8]:
     kinds[list(GROUND)] = _GROUND_KIND
     kinds[SKY] = _SKY_KIND
     kinds[[TRAIN_ID[name] for name in _COMPACT]] = _COMPACT_KIND
+    kinds[TRAIN_ID["pole"]] = _POLE_KIND
     kinds[[TRAIN_ID[name] for name in _HUNG]] = _HUNG_KIND
     return kinds
 
@@ -339,13 +341,13 @@ def _ungrounded(
             depth = depth_by_column[offset[other] + column - left[other]]
             behind_total += np.log(depth)
             behind_count += 1
-            if kind_by_region[other] == 3:
+            if kind_by_region[other] == 4:
                 pole = min(pole, depth)
     # Its foot is hidden below its lowest visible pixel, so the ground there is the farthest it
     # can stand.
     farthest = ground[lowest]
-    if kind_by_region[region] == 4:
-        chosen = min(pole, hung[lowest]) if np.isfinite(pole) else hung[lowest]
+    if kind_by_region[region] == 5:
+        chosen = pole if np.isfinite(pole) else hung[lowest]
     elif behind_count > 0:
         nearest = np.float32(np.exp(behind_total / behind_count))
         chosen = max(nearest, np.float32(nearest * (farthest / nearest) ** behind_share))

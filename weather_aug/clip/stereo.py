@@ -20,7 +20,8 @@ Float32 = NDArray[np.float32]
 MATCH_SIDE_PX = 3
 CHECK_PX = 1.0
 SPECKLE_PX = 120
-HIDDEN_CONFIDENCE = 0.02
+HIDDEN_CONFIDENCE = 0.3
+GUESS_CONFIDENCE = 0.02
 MIN_DISPARITY_PX = 0.4
 MIN_DEPTH_M = 2.5
 MIN_TEXTURE = 6.0
@@ -78,8 +79,10 @@ def stereo_depth(
         like_image("label", label, left.shape[:2])
         sky = label == SKY
     trusted = match.trusted & ~sky
-    values = np.where(trusted, match.disparity_px, _from_background(match.disparity_px, trusted))
-    confidence = np.where(trusted, 1.0, HIDDEN_CONFIDENCE).astype(np.float32)
+    filled, hidden = _from_background(match.disparity_px, trusted)
+    values = np.where(trusted, match.disparity_px, filled)
+    guessed = np.where(hidden, HIDDEN_CONFIDENCE, GUESS_CONFIDENCE)
+    confidence = np.where(trusted, 1.0, guessed).astype(np.float32)
     confidence[sky | (values <= 0)] = 0
     smooth = completed(values, confidence, left, barrier=sky, stiffness=4.0)
     sharp = sharpened(smooth, min_jump=1.5)
@@ -157,13 +160,18 @@ def _dense(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _from_background(disparity_px: Float32, trusted: NDArray[np.bool_]) -> Float32:
+def _from_background(
+    disparity_px: Float32, trusted: NDArray[np.bool_]
+) -> tuple[Float32, NDArray[np.bool_]]:
     """Fill each untrusted run of a row with the smaller disparity of its two ends.
 
     What one camera sees and the other does not is background, hidden behind the nearer surface.
+    The second result marks runs that have the width such a hidden strip has: the difference of
+    the two disparities (and some pixels more, lost to the matching window).
     """
     height, width = disparity_px.shape
     filled = np.zeros((height, width), np.float32)
+    hidden = np.zeros((height, width), np.bool_)
     for row in range(height):
         start = 0
         before = np.float32(0.0)
@@ -171,8 +179,12 @@ def _from_background(disparity_px: Float32, trusted: NDArray[np.bool_]) -> Float
             if column < width and not trusted[row, column]:
                 continue
             after = disparity_px[row, column] if column < width else np.float32(0.0)
-            value = min(before, after) if before > 0 and after > 0 else max(before, after)
-            for hidden in range(start, column):
-                filled[row, hidden] = value
+            inside = before > 0 and after > 0
+            value = min(before, after) if inside else max(before, after)
+            jump = abs(after - before)
+            strip = inside and jump > 2 and column - start < jump + 8
+            for place in range(start, column):
+                filled[row, place] = value
+                hidden[row, place] = strip
             before, start = after, column + 1
-    return filled
+    return filled, hidden

@@ -9,7 +9,6 @@ Float64 = NDArray[np.float64]
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 """Rec. 709 weights of linear RGB."""
-ENCODE_LEVELS = 4096
 
 
 def linear_from_srgb(value: Float64) -> Float64:
@@ -29,9 +28,3 @@ def srgb_from_linear(value: Float64) -> Float64:
 
 SRGB_LEVELS_LINEAR = linear_from_srgb(np.arange(256) / 255.0)
 """(256,) linear light of each 8-bit sRGB level."""
-
-
-def encode_table() -> NDArray[np.uint8]:
-    """(4096,) sRGB level of linear light k / 4095."""
-    light = np.arange(ENCODE_LEVELS) / (ENCODE_LEVELS - 1)
-    return np.round(255 * srgb_from_linear(light)).astype(np.uint8)

@@ -36,7 +36,7 @@ Window = tuple[int, int, int, int]
 
 @dataclass(frozen=True, eq=False)
 class ParticleField:
-    """Particles of one population that drift with the wind and fall; see the module's Convention."""
+    """Particles of one population that drift and fall; see the module's Convention."""
 
     population: Population
     seed: int
@@ -159,7 +159,7 @@ def _planes_and_bounds(
 
 
 def _quantiles_of_exponential() -> Float32:
-    """Mid-quantiles of the unit exponential, scaled to the mean 1 that the truncation takes away."""
+    """Mid-quantiles of the unit exponential, scaled to the mean 1 that truncation lowers."""
     quantiles = -np.log1p(-(np.arange(4096) + 0.5) / 4096)
     return (quantiles / quantiles.mean()).astype(np.float32)
 

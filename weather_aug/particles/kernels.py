@@ -7,14 +7,15 @@ changed constant of another module.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from weather_aug._compiled import compiled
 
 QUARTER_PI = 0.7853981633974483
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def reach(diameter_m, streak_m, focal_px, alpha):
     """Depth at which a particle's pixel opacity falls to `alpha`; 0 if it is fainter everywhere."""
     length_m = streak_m + diameter_m
@@ -26,7 +27,7 @@ def reach(diameter_m, streak_m, focal_px, alpha):
     return focal_px * diameter_m * np.sqrt(QUARTER_PI / alpha)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _fill_reach(diameters_m, per_size, streak_m, focal_px, solid_px, alpha, near_m, far_m, reach_m):
     count = 0.0
     for c in range(diameters_m.shape[0]):
@@ -40,7 +41,7 @@ def _fill_reach(diameters_m, per_size, streak_m, focal_px, solid_px, alpha, near
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def solve_reach(
     diameters_m, per_size, streak_m, focal_px, solid_px, budget, faintest, near_m, far_m
 ):
@@ -65,7 +66,7 @@ def solve_reach(
     return high, reach_m, count
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def resolved_optical_depth(diameters_m, per_size, reach_m, near_m, far_m, bins):
     """Optical depth of the drawn particles from the camera to each of `bins` + 1 depths up to far.
 
@@ -89,7 +90,7 @@ def resolved_optical_depth(diameters_m, per_size, reach_m, near_m, far_m, bins):
     return optical_depth
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _bend(bend, position, slope):
     """Change the slope at `position`: for the rest of its bin, and wholly from the next one on."""
     k = int(position)
@@ -98,7 +99,7 @@ def _bend(bend, position, slope):
     bend[k + 1] += slope - inside
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def mix64(word):
     """Finaliser of splitmix64: a bijection of 64-bit words whose every output bit is mixed."""
     word = (word ^ (word >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -106,7 +107,7 @@ def mix64(word):
     return word ^ (word >> np.uint64(31))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def cell_key(class_key, ix, iy, iz):
     """Key of one cell of one class's lattice."""
     word = class_key + np.uint64(ix) * np.uint64(0xD6E8FEB86659FD93)
@@ -115,7 +116,7 @@ def cell_key(class_key, ix, iy, iz):
     return mix64(word)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _interval(planes, px, py, slack, cell):
     """Range of z (in cells from the camera) that all planes leave to the cell column at (px, py).
 
@@ -134,13 +135,13 @@ def _interval(planes, px, py, slack, cell):
     return low / cell, high / cell
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _turn(word, turns):
     """Place in a sine table of 1024 after `turns`, from a phase in the low bits of `word`."""
     return np.int64(np.float64(word & np.uint64(1023)) + 1024.0 * turns) & 1023
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def scatter(
     class_keys,
     mean_per_cell,

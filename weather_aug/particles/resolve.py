@@ -37,7 +37,7 @@ class Resolved:
     expected_count: float
     """Particles drawn in the whole picture, on average."""
     optical_depth: Float32
-    """(DEPTH_BINS + 1,) carried by drawn particles on the axis, from the camera to k / bins * FAR_M."""
+    """(DEPTH_BINS + 1,) of drawn particles, on the axis, up to the depth k / DEPTH_BINS * FAR_M."""
 
 
 def resolve(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from weather_aug._checks import finite
 from weather_aug._keys import check_seed
 from weather_aug.clip.types import Camera, Frame, FrameKey
-from weather_aug.colour import LUMINANCE, encode_table
+from weather_aug.colour import LUMINANCE
 from weather_aug.edit.physical.overcast import tone
 from weather_aug.errors import ArgumentError
 from weather_aug.particles import statistics
@@ -271,7 +271,6 @@ def _shade(
         order,
         band_starts,
         _falloff(),
-        _encode(),
         *planes.values(),
     )
     return planes
@@ -328,11 +327,6 @@ def _trimmed(
         transmittance=cut(shot["transmittance"][part]),
         depth=cut(depth[part]),
     )
-
-
-@lru_cache(maxsize=1)
-def _encode() -> UInt8:
-    return encode_table()
 
 
 @lru_cache(maxsize=1)

@@ -50,13 +50,12 @@ def readable_labels(
     if transmittance.size == 0 or transmittance.min() >= HAZY_TRANSMITTANCE:
         return out, invalid
     surface = label != SKY
-    contrast = cv2.dilate(
-        np.where(surface, transmittance * gap, 0.0).astype(np.float32),
-        np.ones((NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX), np.uint8),
+    distinct = surface & (transmittance * gap >= _least_linear_contrast(airlight))
+    near_distinct = cv2.dilate(
+        distinct.view(np.uint8), np.ones((NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX), np.uint8)
     )
-    hidden = transmittance < LEAST_TRANSMITTANCE
-    hazy = transmittance < HAZY_TRANSMITTANCE
-    hidden |= hazy & (contrast < _least_linear_contrast(airlight))
+    hidden = (transmittance < HAZY_TRANSMITTANCE) & (near_distinct == 0)
+    hidden |= transmittance < LEAST_TRANSMITTANCE
     hidden &= surface
     out[hidden] = IGNORE
     invalid[hidden | (surface & (transmittance < DOUBTFUL_TRANSMITTANCE))] = 1

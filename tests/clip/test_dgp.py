@@ -127,6 +127,7 @@ def test_a_small_scene_reads(tmp_path: Path) -> None:
     assert clip.cameras == ("CAM",) and clip.name == "dgp-scene_a"
     assert frame.depth_m is not None
     np.testing.assert_allclose(10.0, frame.depth_m, rtol=0.02)
+    assert not frame.image.flags.writeable and not frame.depth_m.flags.writeable
     assert [box.class_name for box in frame.boxes] == ["Car"]
     np.testing.assert_allclose([15.0, 0, 1], frame.boxes[0].world_from_box[:3, 3])
     assert clip.frame(clip.keys[1]).time_s == pytest.approx(0.1)

@@ -190,6 +190,17 @@ def test_scale_shrinks_all_together(tmp_path: Path) -> None:
     assert small.depth_m[12, 2] == pytest.approx(between, rel=1e-4)
 
 
+def test_frames_are_read_only_and_repeat(tmp_path: Path) -> None:
+    _picture(tmp_path / "images" / "a.png")
+    _labels(tmp_path / "labels" / "a.png")
+    clip = FolderClip(tmp_path, images="images", labels="labels")
+    first, second = clip.frame(clip.keys[0]), clip.frame(clip.keys[0])
+    for name in ("image", "label", "depth_m"):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(first, name)[0, 0] = 1
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+
+
 def test_a_teacher_labels_what_has_none(tmp_path: Path) -> None:
     _picture(tmp_path / "images" / "a.png")
     clip = LabelledClip(FolderClip(tmp_path, images="images"), lambda image: _label())

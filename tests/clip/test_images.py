@@ -171,3 +171,23 @@ def _temporary(kind: str, share: float) -> Path:
     path = _SCRATCH[0] / f"cut.{kind.lower()}"
     path.write_bytes(whole[: int(share * len(whole))])
     return path
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    kind=st.sampled_from(["PNG", "JPEG"]),
+    flips=st.lists(st.tuples(st.floats(0, 0.9999), st.integers(0, 7)), min_size=1, max_size=6),
+)
+def test_a_damaged_picture_is_read_or_a_typed_error(
+    kind: str, flips: list[tuple[float, int]]
+) -> None:
+    path = _temporary(kind, 1.0)
+    data = bytearray(path.read_bytes())
+    for share, bit in flips:
+        data[int(share * len(data))] ^= 1 << bit
+    path.write_bytes(data)
+    for read in (read_image, read_label):
+        try:
+            read(path)
+        except ClipError as error:
+            assert path.name in str(error)

@@ -116,6 +116,8 @@ def test_a_clip_travels_to_a_worker_and_frames_repeat() -> None:
     clip = KittiOdometryClip(ODOMETRY, frames=slice(3, 4), scale=0.25)
     twin = pickle.loads(pickle.dumps(clip))
     first, second = clip.frame(clip.keys[0]), twin.frame(clip.keys[0])
+    assert first.depth_m is not None
+    assert not first.image.flags.writeable and not first.depth_m.flags.writeable
     np.testing.assert_array_equal(first.image, second.image)
     np.testing.assert_array_equal(first.depth_m, second.depth_m)
     with pytest.raises(ClipError, match="has no frame"):

@@ -72,6 +72,20 @@ def test_a_sign_hangs_on_its_pole() -> None:
     assert depth[95, 395] == pytest.approx(_ground_m(239), rel=0.01)
 
 
+def test_a_sign_without_a_pole_is_not_behind_the_facade_it_covers() -> None:
+    label = _street()
+    label[170:178, 30:40] = SIGN
+    assert _depth(label)[174, 35] <= _ground_m(214) * 1.01
+
+
+def test_a_broken_pole_is_one_pole() -> None:
+    label = _street()
+    label[20:90, 400:404] = POLE
+    label[112:116, 400:404] = SKY
+    depth = _depth(label)
+    np.testing.assert_allclose(_ground_m(239), depth[20:90, 400:404], rtol=0.01)
+
+
 def test_a_hidden_facade_stands_behind_what_hides_it() -> None:
     label = np.full((HEIGHT, WIDTH), SKY, np.uint8)
     label[60:190] = BUILDING

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from weather_aug.clip.images import read_image, resized_image
+from weather_aug.clip.images import read_image, read_only, resized_image
 from weather_aug.clip.lidar import lidar_depth
 from weather_aug.clip.motion import velocities
 from weather_aug.clip.poses import Float64, inverse_motion, motion_from_quaternion
@@ -89,7 +89,7 @@ class DgpClip:
         scene_path = _scene_path(folder_at(root, "DGP data set"), scene)
         self._folder = scene_path.parent
         self.name = folder_name("dgp", self._folder.resolve().name)
-        self.up_world = np.array([0.0, 0.0, 1.0])
+        self.up_world = read_only(np.array([0.0, 0.0, 1.0]))
         record = read_json(scene_path)
         shots = _shots(record, self._folder)
         present = sorted({camera for _, camera in shots})
@@ -122,13 +122,13 @@ class DgpClip:
                 f"{camera.width}x{camera.height}; copy the picture again"
             )
         size = scaled_size(camera.width, camera.height, self._scale)
-        image, camera = resized_image(image, *size), camera.resized(*size)
+        image, camera = read_only(resized_image(image, *size)), camera.resized(*size)
         if shot.sweep is None:
             return Frame(key, shot.time_s, camera, image)
         points_world = _points_world(shot.sweep)
         camera_from_world = inverse_motion(camera.world_from_camera)
         points_camera = points_world @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
-        depth_m = lidar_depth(points_camera, camera.intrinsics, image)
+        depth_m = read_only(lidar_depth(points_camera, camera.intrinsics, image))
         boxes = _boxes(shot.sweep, self._class_names)
         return Frame(key, shot.time_s, camera, image, depth_m=depth_m, boxes=boxes)
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from weather_aug._checks import finite
 from weather_aug.clip.completion import completed, depth_jump, sharpened
-from weather_aug.clip.images import read_image, read_label, resized_image, resized_label
+from weather_aug.clip.images import read_image, read_label, read_only, resized_image, resized_label
 from weather_aug.clip.prior import geometric_prior_depth
 from weather_aug.clip.records import (
     checked_scale,
@@ -122,7 +122,7 @@ class FolderClip:
         self._fps = finite("fps", fps, 1e-3, 1e4)
         self.name = folder_name("folder", top.resolve().name, "" if images == "." else images)
         self.cameras: tuple[str, ...] = (CAMERA,)
-        self.up_world = np.array([0.0, -1.0, 0.0])
+        self.up_world = read_only(np.array([0.0, -1.0, 0.0]))
         aside = [top / name for name in (labels, depth) if name is not None]
         picture_paths = _by_stem(top / images, _PICTURES, _IMAGE_ENDINGS, aside)
         stems = sorted(picture_paths)
@@ -149,11 +149,13 @@ class FolderClip:
         size = scaled_size(width, height, self._scale)
         image = resized_image(whole, *size)
         camera = self._camera(index, width, height).resized(*size)
-        label = None if self._labels is None else self._label(index, whole)
-        if label is not None:
-            label = resized_label(label, *size)
+        label = None
+        if self._labels is not None:
+            label = read_only(resized_label(self._label(self._labels[index], index, whole), *size))
         depth_m = self._depth(index, whole, image, label, camera)
-        return Frame(key, index / self._fps, camera, image, label, depth_m)
+        if depth_m is not None:
+            depth_m = read_only(depth_m)
+        return Frame(key, index / self._fps, camera, read_only(image), label, depth_m)
 
     def _camera(self, index: int, width: int, height: int) -> Camera:
         focal_px = self._focal_px or 0.5 * width / math.tan(0.5 * self._hfov_rad)
@@ -172,9 +174,7 @@ class FolderClip:
             velocity_m_per_s=np.array([0.0, 0.0, self._speed_m_per_s]),
         )
 
-    def _label(self, index: int, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        assert self._labels is not None
-        path = self._labels[index]
+    def _label(self, path: Path, index: int, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         ids = read_label(path)
         _like_picture(path, ids.shape, self._images[index], image)
         return self._taxonomy.train_ids(ids, where=shown(path))

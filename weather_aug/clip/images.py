@@ -11,7 +11,7 @@ import io
 import struct
 import zlib
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -20,6 +20,8 @@ from PIL import Image, JpegImagePlugin, PngImagePlugin
 
 from weather_aug._checks import MAX_PIXELS
 from weather_aug.errors import ClipError, printable
+
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 MAX_FILE_BYTES = 256 * 2**20
 MAX_PIXELS_PER_BYTE = 2000
@@ -127,6 +129,12 @@ def resized_label(label: NDArray[np.uint8], width: int, height: int) -> NDArray[
         return label
     sampled = cv2.resize(label, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
     return np.asarray(sampled, np.uint8)
+
+
+def read_only(array: NDArray[Scalar]) -> NDArray[Scalar]:
+    """Return `array`, locked against writing."""
+    array.flags.writeable = False
+    return array
 
 
 def _checked_bytes(path: Path) -> tuple[bytes, ImageHeader]:

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from weather_aug.clip.images import read_image, resized_image
+from weather_aug.clip.images import read_image, read_only, resized_image
 from weather_aug.clip.lidar import lidar_depth
 from weather_aug.clip.motion import velocities
 from weather_aug.clip.poses import Float64, inverse_motion, rigid_motion, up_from_travel
@@ -100,7 +100,7 @@ class KittiOdometryClip:
             side: _Motion(world_from_camera0, self._projections[side][1], self._times_s)
             for side in self.cameras
         }
-        self.up_world = up_from_travel(world_from_camera0)
+        self.up_world = read_only(up_from_travel(world_from_camera0))
         chosen = [present[i] for i in chosen_indices(frames, len(present))]
         self.keys = tuple(FrameKey(index, side) for index in chosen for side in self.cameras)
 
@@ -122,7 +122,9 @@ class KittiOdometryClip:
         measure = stereo_depth if side == "left" else right_depth
         depth_m = measure(left, right, focal_px=camera.focal_px[0], baseline_m=baseline_m)
         picture = left if side == "left" else right
-        return Frame(key, float(self._times_s[index]), camera, picture, depth_m=depth_m)
+        return Frame(
+            key, float(self._times_s[index]), camera, read_only(picture), depth_m=read_only(depth_m)
+        )
 
     def _view(self, side: str, index: int) -> NDArray[np.uint8]:
         path = self._files[side].get(index)
@@ -185,7 +187,7 @@ class KittiRawClip:
             )
         self._times_s = _raw_times(self._root, len(world_from_camera0), rate_hz)
         self._motion = _Motion(world_from_camera0, self._projection[1], self._times_s)
-        self.up_world = up_from_travel(world_from_camera0)
+        self.up_world = read_only(up_from_travel(world_from_camera0))
         chosen = [present[i] for i in chosen_indices(frames, len(present))]
         self.keys = tuple(FrameKey(index, "left") for index in chosen)
 
@@ -201,7 +203,9 @@ class KittiRawClip:
         points = read_floats(self._scans[index], 4)[:, :3].astype(np.float64)
         points_camera = points @ camera_from_velodyne[:3, :3].T + camera_from_velodyne[:3, 3]
         depth_m = lidar_depth(points_camera, camera.intrinsics, image)
-        return Frame(key, float(self._times_s[index]), camera, image, depth_m=depth_m)
+        return Frame(
+            key, float(self._times_s[index]), camera, read_only(image), depth_m=read_only(depth_m)
+        )
 
 
 class _Motion:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from weather_aug.clip.images import read_only
 from weather_aug.clip.types import Clip, Float64, Frame, FrameKey
 from weather_aug.errors import ArgumentError
 from weather_aug.taxonomy import CLASSES, IGNORE
@@ -63,7 +64,7 @@ class LabelledClip:
             return frame
         # A copy, so that a teacher that normalises in place does not spoil the frame.
         label = checked_train_ids(self._teacher(frame.image.copy()), frame.image.shape[:2])
-        return replace(frame, label=label)
+        return replace(frame, label=read_only(label.copy()))
 
 
 def checked_train_ids(label: Any, shape: tuple[int, int]) -> NDArray[np.uint8]:

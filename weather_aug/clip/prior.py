@@ -60,8 +60,9 @@ def geometric_prior_depth(
     a depth per column from its contact with the ground: smoothed along facades, the nearest within
     the region's own height for cars, people and poles. Columns whose foot is hidden take the
     nearest visible contact of the region; a region that touches no ground stands between what
-    hides its foot and the ground at its lowest row; signs and lights hang at 2.8 m. Ignored
-    pixels take the class of the nearest pixel.
+    hides its foot and the ground at its lowest row; signs and lights hang on the
+    pole below them, or at 2.8 m before what they cover. Ignored pixels take the class of the
+    nearest pixel.
 
     Args:
         label: (H, W) uint8 train ids, 255 ignored.
@@ -325,6 +326,7 @@ def _ungrounded(
     depth_by_column: Float32,
 ) -> None:
     """Place a region that touches no ground: behind what hides its foot, or hanging in the air."""
+    height = regions.shape[0]
     first, last = offset[region], offset[region + 1]
     lowest = 0
     behind_total = np.float64(0.0)
@@ -341,15 +343,22 @@ def _ungrounded(
             depth = depth_by_column[offset[other] + column - left[other]]
             behind_total += np.log(depth)
             behind_count += 1
-            if kind_by_region[other] == 4:
-                pole = min(pole, depth)
+        # Signs hang on poles, and thin poles break into pieces in a label map.
+        for below in range(row + 1, min(height, row + 2 + height // 12)):
+            other = regions[below, column]
+            if kind_by_region[other] == 4 and grounded[other]:
+                pole = min(pole, depth_by_column[offset[other] + column - left[other]])
     # Its foot is hidden below its lowest visible pixel, so the ground there is the farthest it
     # can stand.
     farthest = ground[lowest]
-    if kind_by_region[region] == 5:
-        chosen = pole if np.isfinite(pole) else hung[lowest]
-    elif behind_count > 0:
+    nearest = np.float32(np.inf)
+    if behind_count > 0:
         nearest = np.float32(np.exp(behind_total / behind_count))
+    if kind_by_region[region] >= 4 and np.isfinite(pole):
+        chosen = pole
+    elif kind_by_region[region] == 5:
+        chosen = min(hung[lowest], nearest)
+    elif behind_count > 0:
         chosen = max(nearest, np.float32(nearest * (farthest / nearest) ** behind_share))
     else:
         chosen = farthest

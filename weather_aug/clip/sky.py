@@ -51,6 +51,8 @@ def _sky_coloured(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
     brightness = np.maximum(np.maximum(red, green), blue)
     greyness = brightness - np.minimum(np.minimum(red, green), blue)
     bright = (brightness >= MIN_BRIGHTNESS) & (greyness <= 0.18 * brightness)
+    # Daylight cloud is grey or bluish; sunlit plaster and stone are warm.
+    bright &= red <= blue + 8
     blueish = (brightness >= MIN_BLUE_BRIGHTNESS) & (blue >= green) & (green >= red - 4)
     return np.asarray(bright | (blueish & (blue > red + 8)))
 

@@ -10,7 +10,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, BinaryIO
 
 from weather_aug.errors import DataError, OutputError, printable
 
@@ -24,11 +24,24 @@ def write_whole(path: Path, data: bytes) -> None:
     Raises:
         OutputError: If the disk is full or the folder cannot be written; no partial file stays.
     """
+    with whole_file(path) as file:
+        file.write(data)
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a file that appears under its name only when the block ends without an error.
+
+    For content too large to hold in memory; else `write_whole`.
+
+    Raises:
+        OutputError: If the disk is full or the folder cannot be written; no partial file stays.
+    """
     temporary = path.with_name(path.name + TEMPORARY_SUFFIX)
     with reported(path):
         try:
             with temporary.open("wb") as file:
-                file.write(data)
+                yield file
                 file.flush()
                 os.fsync(file.fileno())
             temporary.replace(path)

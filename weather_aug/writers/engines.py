@@ -1,0 +1,187 @@
+"""Who renders the samples: this process, or worker processes that may die without harm.
+
+An engine gives (item, manifest line) in the order of completion; it writes samples, never the
+journal. Workers are started afresh (spawn), take one item at a time, and are told apart by their
+pipes, so that one that dies is noticed at once and costs at most the item it had.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+from collections import Counter
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+from multiprocessing import connection
+from pathlib import Path
+from typing import Any
+
+from weather_aug import _files
+from weather_aug.errors import IntegrityError, WeatherAugError
+from weather_aug.render.compose import warm_up
+from weather_aug.writers import layout
+from weather_aug.writers.plan import ExportPlan
+from weather_aug.writers.sample import write_sample
+from weather_aug.writers.worker import DONE, FAILED, READY, work
+
+MAX_RETRIES = 2
+"""How often an item whose worker died is given to a fresh one."""
+MAX_QUARANTINED = 8
+"""Items lost after which it is the machine that is at fault, and the run ends."""
+MAX_FAILED_STARTS = 3
+STOP_WAIT_S = 5.0
+
+Finished = tuple[int, str]
+
+
+def run_inline(
+    plan: ExportPlan, out: Path, items: Iterator[int]
+) -> Generator[Finished, None, None]:
+    """Render items one after the other in this process."""
+    for index in items:
+        yield index, write_sample(plan, out, index)
+
+
+def run_processes(
+    plan: ExportPlan, out: Path, items: Iterator[int], workers: int
+) -> Generator[Finished, None, None]:
+    """Render items in `workers` processes.
+
+    Raises:
+        IntegrityError: After all other items, if an item killed three workers; it names them.
+        WeatherAugError: If workers cannot be started, or the first error of a worker.
+    """
+    warm_up()
+    crew = _Crew(plan, out, items)
+    try:
+        for _ in range(workers):
+            crew.start(None)
+        while crew.members:
+            yield from crew.finished()
+    finally:
+        crew.stop()
+    crew.raise_if_lost()
+
+
+@dataclass(eq=False)
+class _Member:
+    """A worker, as its parent sees it."""
+
+    process: Any
+    pipe: connection.Connection
+    item: int | None
+    """The item that it has, or gets as soon as it is ready."""
+    ready: bool = False
+
+
+class _Crew:
+    """The workers at one output and the items still to be given to them."""
+
+    def __init__(self, plan: ExportPlan, out: Path, items: Iterator[int]) -> None:
+        self.members: list[_Member] = []
+        self._plan, self._out, self._items = plan, out, items
+        self._context = multiprocessing.get_context("spawn")
+        self._deaths: Counter[int] = Counter()
+        self._lost: list[int] = []
+        self._failed_starts = 0
+
+    def start(self, item: int | None) -> None:
+        """Start a worker that gets `item`, or the next one if None; none if nothing is left."""
+        item = next(self._items, None) if item is None else item
+        if item is None:
+            return
+        ours, theirs = self._context.Pipe()
+        process = self._context.Process(
+            target=work, args=(self._plan, self._out, theirs), daemon=True, name="export worker"
+        )
+        process.start()
+        # The worker's copy must be the only one, or its death would not close the pipe.
+        theirs.close()
+        self.members.append(_Member(process, ours, item))
+
+    def finished(self) -> Iterator[Finished]:
+        """Wait until a worker says something or dies; give the items that were finished."""
+        heard = connection.wait([member.pipe for member in self.members])
+        for member in [m for m in self.members if m.pipe in heard]:
+            try:
+                kind, value = member.pipe.recv()
+            except (EOFError, OSError):
+                self._bury(member)
+                continue
+            if kind == FAILED:
+                raise _with_note(*value)
+            done = member.item
+            if kind == READY:
+                member.ready, self._failed_starts = True, 0
+            else:
+                assert kind == DONE
+                member.item = next(self._items, None)
+            self._assign(member)
+            if kind == DONE and done is not None:
+                yield done, value
+
+    def stop(self) -> None:
+        """End the workers that are left, whatever they do."""
+        for member in self.members:
+            member.pipe.close()
+            member.process.kill()
+        for member in self.members:
+            member.process.join(STOP_WAIT_S)
+        self.members.clear()
+
+    def raise_if_lost(self) -> None:
+        """Name the items that no worker survived, if there are any."""
+        if not self._lost:
+            return
+        recipes = [{"item": index, "recipe": self._plan.recipe(index)} for index in self._lost]
+        lines = [json.dumps(recipe) for recipe in recipes]
+        path = self._out / layout.QUARANTINE
+        _files.write_whole(path, ("\n".join(lines) + "\n").encode())
+        raise IntegrityError(
+            f"{len(lines)} item(s) killed {MAX_RETRIES + 1} workers each and are missing: "
+            f"{', '.join(str(index) for index in self._lost)} (recipes in {path}); the first is "
+            f"{lines[0]}; free memory or use fewer workers, then run it again to continue"
+        )
+
+    def _assign(self, member: _Member) -> None:
+        """Hand a worker its item; one without an item goes home."""
+        try:
+            member.pipe.send(member.item)
+        except OSError:
+            # It died just now: its pipe says so in the next round, with the item still its own.
+            return
+        if member.item is None:
+            self._dismiss(member)
+
+    def _dismiss(self, member: _Member) -> None:
+        member.process.join(STOP_WAIT_S)
+        member.pipe.close()
+        self.members.remove(member)
+
+    def _bury(self, member: _Member) -> None:
+        """Replace a worker that died, and count its death against the item that it had."""
+        self._dismiss(member)
+        item = member.item
+        if not member.ready:
+            self._failed_starts += 1
+            if self._failed_starts >= MAX_FAILED_STARTS:
+                raise WeatherAugError(
+                    f"export workers end while they start (exit code {member.process.exitcode}); "
+                    "a script that exports must stand under `if __name__ == '__main__':`; with "
+                    "workers=1 it runs without them"
+                )
+        elif item is not None:
+            self._deaths[item] += 1
+            if self._deaths[item] > MAX_RETRIES:
+                self._lost.append(item)
+                item = None
+            if len(self._lost) >= MAX_QUARANTINED:
+                self.raise_if_lost()
+        self.start(item)
+
+
+def _with_note(error: Exception, trace: str) -> Exception:
+    """A worker's error; one that is not ours keeps the place where it happened."""
+    if not isinstance(error, WeatherAugError):
+        error.add_note(f"in an export worker:\n{trace}")
+    return error

@@ -1,0 +1,212 @@
+"""Export: render a plan to disk, survive being killed, give the same bytes however it went.
+
+A sample's files are written whole (temporary file, sync, rename), then one line of the journal
+commits it. The root files are made from the complete journal at the end, `export.json` last. The
+same call continues interrupted work, repairs a damaged export, and does nothing to a finished one.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from weather_aug import _files
+from weather_aug._checks import finite
+from weather_aug.errors import ConflictError, DataError, IntegrityError, printable
+from weather_aug.writers import layout
+from weather_aug.writers.engines import Finished, run_inline, run_processes
+from weather_aug.writers.journal import Journal, job_of, write_journal
+from weather_aug.writers.lock import check_output, exclusive
+from weather_aug.writers.manifest import finish, is_finished_whole, usable_lines
+from weather_aug.writers.plan import ExportPlan
+
+MAX_WORKERS = 1024
+
+
+@dataclass(frozen=True)
+class ExportReport:
+    """What an export holds now, and what this run did for it."""
+
+    out: Path
+    samples: int
+    rendered: int
+    """Samples made by this run; the others were there, whole."""
+    damaged: int
+    """Samples that an earlier run had committed, but whose files were no longer whole."""
+    labelled: int
+    bytes: int
+    """Of all pictures and labels."""
+    classes: tuple[int, ...]
+    """Train ids in the class statistics."""
+    dropped_classes: tuple[int, ...]
+    """Train ids that occur, but never with enough pixels for rare-class sampling."""
+    seconds: float
+
+
+def export(
+    plan: ExportPlan,
+    out: Path,
+    *,
+    workers: int = 1,
+    progress: bool = False,
+    verify: bool = False,
+    on_sample: Callable[[dict[str, Any]], None] | None = None,
+) -> ExportReport:
+    """Render all items of `plan` into the folder `out`.
+
+    The tree that comes out depends on the plan alone: not on `workers`, on interruptions, or on
+    damage repaired on the way.
+
+    Args:
+        plan: What to render; see `plan_export`.
+        out: Folder to make or to continue; its parent must exist.
+        workers: Processes; up to 1 renders in this one.
+        progress: Show a bar with rate and time left.
+        verify: Compare digests, not only sizes, where the export is finished already.
+        on_sample: Called with each newly committed sample's entry of the manifest, in the order of
+            completion.
+
+    Raises:
+        ConflictError: If another process exports to `out`, or it holds another job or other files.
+        OutputError: If `out` lies inside a scene, is a file, or cannot be written.
+        SceneError: If a scene cannot be read.
+        IntegrityError: If items are missing because they killed their workers.
+    """
+    start_s = time.monotonic()
+    finite("workers", workers, 0, MAX_WORKERS)
+    out = check_output(Path(out), [scene.path for scene in plan.scenes])
+    rendered = damaged = 0
+    with exclusive(out):
+        _remove_leftovers(out)
+        if _needs_work(plan, out, verify):
+            with Journal(out / layout.JOURNAL, plan, out) as journal:
+                damaged = journal.damaged
+                _make_folders(plan, out)
+                rendered = _render(plan, out, journal, int(workers), progress, on_sample)
+                finish(plan, out, journal)
+        contents = layout.read_contents(out)
+        with _files.reported(out):
+            for name in (layout.QUARANTINE, layout.JOURNAL):
+                (out / name).unlink(missing_ok=True)
+    return ExportReport(
+        out=out,
+        samples=contents["samples"],
+        rendered=rendered,
+        damaged=damaged,
+        labelled=contents["labelled"],
+        bytes=contents["bytes"],
+        classes=tuple(contents["classes"]),
+        dropped_classes=tuple(contents["dropped_classes"]),
+        seconds=time.monotonic() - start_s,
+    )
+
+
+def _needs_work(plan: ExportPlan, out: Path, verify: bool) -> bool:
+    """Whether something is to be rendered or written; if so there is a journal of this job."""
+    path = out / layout.JOURNAL
+    if not (out / layout.CONTENTS).exists():
+        if path.exists():
+            _check_job(plan, job_of(path), out)
+        else:
+            write_journal(path, plan.job)
+        return True
+    try:
+        contents = layout.read_contents(out)
+    except (DataError, IntegrityError) as error:
+        raise IntegrityError(
+            f"{error}; the job of this export is unknown, so it cannot be repaired: remove the "
+            "folder and export again"
+        ) from None
+    _check_job(plan, contents["job"], out)
+    if is_finished_whole(out, contents, digests=verify):
+        return False
+    write_journal(path, plan.job, usable_lines(out, contents))
+    with _files.reported(out):
+        (out / layout.CONTENTS).unlink()
+        _files.sync_folder(out)
+    return True
+
+
+def _check_job(plan: ExportPlan, found: Any, out: Path) -> None:
+    """Refuse an output that belongs to another job; name the first field that differs."""
+    found = found if isinstance(found, dict) else {}
+    for name in dict.fromkeys([*plan.job, *found]):
+        theirs, ours = (_text(job.get(name)) for job in (found, plan.job))
+        if theirs != ours:
+            raise ConflictError(
+                f"{printable(out, 200)} belongs to another job: its {name} is "
+                f"{printable(theirs, 120)}, this job's is {printable(ours, 120)}; choose another "
+                "folder, or remove this one"
+            )
+
+
+def _text(value: Any) -> str:
+    """JSON text; unlike a comparison of mappings it sees the order of a policy's types."""
+    return json.dumps(value)
+
+
+def _remove_leftovers(out: Path) -> None:
+    """Remove temporary files of an exporter that was killed."""
+    with _files.reported(out):
+        for folder in (out, out / layout.STATE):
+            for path in folder.glob(f"*{_files.TEMPORARY_SUFFIX}"):
+                path.unlink()
+        for root in layout.SAMPLE_ROOTS:
+            for path in (out / root).rglob(f"*.png{_files.TEMPORARY_SUFFIX}"):
+                path.unlink()
+
+
+def _make_folders(plan: ExportPlan, out: Path) -> None:
+    with _files.reported(out):
+        for relative in plan.folders():
+            folder = out / relative
+            folder.mkdir(parents=True, exist_ok=True)
+            while folder != out:
+                folder = folder.parent
+                _files.sync_folder(folder)
+
+
+def _render(
+    plan: ExportPlan,
+    out: Path,
+    journal: Journal,
+    workers: int,
+    progress: bool,
+    on_sample: Callable[[dict[str, Any]], None] | None,
+) -> int:
+    """Render and commit what the journal misses; how many samples that were."""
+    from tqdm.auto import tqdm
+
+    if journal.committed == plan.count:
+        return 0
+    rendered = 0
+    with (
+        closing(_engine(plan, out, journal.missing(), workers)) as finished,
+        tqdm(
+            total=plan.count,
+            initial=journal.committed,
+            desc="export",
+            unit="sample",
+            disable=not progress,
+        ) as bar,
+    ):
+        for index, line in finished:
+            journal.append(index, line)
+            rendered += 1
+            bar.update()
+            if on_sample is not None:
+                on_sample(json.loads(line))
+    return rendered
+
+
+def _engine(
+    plan: ExportPlan, out: Path, items: Iterator[int], workers: int
+) -> Generator[Finished, None, None]:
+    if workers <= 1:
+        return run_inline(plan, out, items)
+    return run_processes(plan, out, items, workers)

@@ -1,0 +1,203 @@
+"""The journal: an append-only list of committed samples, trusted no further than its digests.
+
+Line 1 is the job; every other line is a sample's line of the manifest, in the order of completion.
+Each starts with the head of its own SHA-256, so that a line cut or changed by a crash is noticed.
+Only the exporting process writes it; a sample is committed by its line and by nothing else.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from weather_aug import _files
+from weather_aug.errors import DataError, IntegrityError, printable
+from weather_aug.writers.plan import ExportPlan
+
+SYNC_EVERY = 64
+"""Lines between two syncs to disk: what a power cut can cost; a killed process loses none."""
+
+_SEAL_LENGTH = 16
+
+
+def sealed(text: str) -> bytes:
+    """A line of the journal."""
+    return f"{_files.sha256_of(text.encode())[:_SEAL_LENGTH]} {text}\n".encode()
+
+
+def unsealed(line: bytes) -> str | None:
+    """The text of a journal's line, or None if the line is not as it was written."""
+    seal, _, text = line.rstrip(b"\n").partition(b" ")
+    whole = line.endswith(b"\n") and seal.decode("ascii", "replace") == _files.sha256_of(text)[:16]
+    return text.decode() if whole else None
+
+
+def job_of(path: Path) -> Any:
+    """The job that a journal belongs to.
+
+    Raises:
+        IntegrityError: If its first line is damaged.
+    """
+    with _files.reported(path), path.open("rb") as file:
+        head = unsealed(file.readline())
+    if head is None:
+        raise IntegrityError(
+            f"{printable(path, 200)} is damaged, so the job it belongs to is unknown; remove its "
+            "export and start again"
+        )
+    return json.loads(head)
+
+
+def write_journal(path: Path, job: dict[str, Any], lines: Iterable[str] = ()) -> None:
+    """Write a journal of `job` that holds `lines` so far."""
+    with _files.whole_file(path) as file:
+        file.write(sealed(json.dumps(job, allow_nan=False)))
+        for line in lines:
+            file.write(sealed(line))
+
+
+def is_whole(out: Path, files: dict[str, Any], *, digests: bool) -> bool:
+    """Whether a sample's files are there with their sizes and (`digests`) their bytes."""
+    for entry in files.values():
+        try:
+            path = _files.file_inside(out, entry["path"])
+            if path.stat().st_size != entry["size"]:
+                return False
+            if digests and _files.sha256_of_file(path) != entry["sha256"]:
+                return False
+        except (DataError, OSError):
+            return False
+    return True
+
+
+class Journal:
+    """An open journal: append committed samples, read them back by item.
+
+    It keeps one offset an item in memory, not the lines.
+    """
+
+    def __init__(self, path: Path, plan: ExportPlan, out: Path) -> None:
+        """Open a journal; lines whose files are not whole are dropped from it.
+
+        Raises:
+            OutputError: If it cannot be written.
+        """
+        self.path = path
+        self._offsets = np.full(plan.count, -1, np.int64)
+        lines = _Kept(path, plan, out)
+        write_journal(path, plan.job, lines)
+        self.damaged = lines.dropped
+        with _files.reported(path):
+            # Unbuffered: a line that was appended survives the death of this process.
+            self._file = path.open("ab", buffering=0)
+            self._reader = path.open("rb")
+        self._index_lines()
+        self._unsynced = 0
+
+    @property
+    def committed(self) -> int:
+        """How many items are committed."""
+        return int(np.count_nonzero(self._offsets >= 0))
+
+    def missing(self) -> Iterator[int]:
+        """Items that are not committed, in order."""
+        return (index for index in range(len(self._offsets)) if self._offsets[index] < 0)
+
+    def append(self, index: int, line: str) -> None:
+        """Commit an item.
+
+        Raises:
+            OutputError: If the line cannot be written; the item is then not committed.
+        """
+        with _files.reported(self.path):
+            offset = self._file.tell()
+            rest = memoryview(sealed(line))
+            while rest:
+                rest = rest[self._file.write(rest) :]
+            self._offsets[index] = offset
+            self._unsynced += 1
+            if self._unsynced >= SYNC_EVERY:
+                self._sync()
+
+    def line(self, index: int) -> str:
+        """A committed item's line of the manifest.
+
+        Raises:
+            IntegrityError: If the journal was changed meanwhile.
+        """
+        self._reader.seek(int(self._offsets[index]))
+        text = unsealed(self._reader.readline())
+        if text is None:
+            raise IntegrityError(f"{printable(self.path, 200)} was changed by another program")
+        return text
+
+    def __enter__(self) -> Journal:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        try:
+            with _files.reported(self.path):
+                self._sync()
+        except OSError:
+            # An error on the way out must not hide the one that led here.
+            if error is None:
+                raise
+        finally:
+            self._reader.close()
+            self._file.close()
+
+    def _sync(self) -> None:
+        os.fsync(self._file.fileno())
+        self._unsynced = 0
+
+    def _index_lines(self) -> None:
+        offset = len(self._reader.readline())
+        for line in self._reader:
+            text = unsealed(line)
+            assert text is not None
+            self._offsets[json.loads(text)["item"]] = offset
+            offset += len(line)
+        self._file.seek(0, os.SEEK_END)
+
+
+class _Kept:
+    """The lines of an interrupted journal whose files are whole; counts the others."""
+
+    def __init__(self, path: Path, plan: ExportPlan, out: Path) -> None:
+        self._path, self._plan, self._out = path, plan, out
+        self.dropped = 0
+
+    def __iter__(self) -> Iterator[str]:
+        seen = np.zeros(self._plan.count, bool)
+        with self._path.open("rb") as file:
+            file.readline()
+            for line in file:
+                text = unsealed(line)
+                index = None if text is None else self._whole_item(text)
+                if text is None or index is None:
+                    self.dropped += 1
+                elif not seen[index]:
+                    seen[index] = True
+                    yield text
+
+    def _whole_item(self, text: str) -> int | None:
+        """The item of a line if it is one of the plan's and its files are as written."""
+        try:
+            entry = _files.parse_json(text, str(self._path))
+            index, files = int(entry["item"]), entry["files"]
+            paths = {part: file["path"] for part, file in files.items()}
+            in_plan = 0 <= index < self._plan.count and paths == self._plan.paths(index)
+        except (DataError, KeyError, TypeError, ValueError, AttributeError):
+            return None
+        return index if in_plan and is_whole(self._out, files, digests=True) else None

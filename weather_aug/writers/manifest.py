@@ -1,0 +1,89 @@
+"""The files at the root of a finished export; `export.json`, the last of them, makes it one."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from weather_aug import _files
+from weather_aug.errors import DataError
+from weather_aug.writers import layout
+from weather_aug.writers.cityscapes import ClassStats
+from weather_aug.writers.journal import Journal, is_whole
+from weather_aug.writers.plan import ExportPlan
+
+
+def finish(plan: ExportPlan, out: Path, journal: Journal) -> None:
+    """Write manifest, class statistics and `export.json` from a journal of all items.
+
+    Raises:
+        OutputError: If a file cannot be written.
+    """
+    stats = ClassStats(plan.count)
+    counts: Counter[str] = Counter()
+    kinds: Counter[str] = Counter()
+    with _files.whole_file(out / layout.MANIFEST) as file:
+        for index in range(plan.count):
+            line = journal.line(index)
+            file.write(f"{line}\n".encode())
+            entry = json.loads(line)
+            stats.add(index, entry["class_pixels"])
+            kinds[entry["recipe"]["kind"]] += 1
+            counts["labelled"] += "label" in entry["files"]
+            counts["bytes"] += sum(part["size"] for part in entry["files"].values())
+    names = [layout.MANIFEST]
+    if counts["labelled"]:
+        names += stats.write(out, lambda index: plan.paths(index).get("label"))
+    contents = {
+        "format": layout.FORMAT,
+        "version": layout.VERSION,
+        "job": plan.job,
+        "samples": plan.count,
+        **counts,
+        "samples_by_kind": dict(sorted(kinds.items())),
+        "classes": list(stats.kept),
+        "dropped_classes": list(stats.dropped),
+        "files": {name: _stored(out / name) for name in names},
+    }
+    _files.write_whole(out / layout.CONTENTS, layout.sealed_contents(contents))
+
+
+def is_finished_whole(out: Path, contents: dict[str, Any], *, digests: bool) -> bool:
+    """Whether all files of a finished export are there with their sizes and (`digests`) bytes.
+
+    The few files at the root are compared by digest in any case.
+    """
+    if not all(_root_is_whole(out, name, file) for name, file in contents["files"].items()):
+        return False
+    return all(
+        is_whole(out, json.loads(line)["files"], digests=digests) for line in manifest_lines(out)
+    )
+
+
+def usable_lines(out: Path, contents: dict[str, Any]) -> Iterator[str]:
+    """Lines of a finished export's manifest, none if the manifest itself was changed."""
+    if _root_is_whole(out, layout.MANIFEST, contents["files"][layout.MANIFEST]):
+        yield from manifest_lines(out)
+
+
+def manifest_lines(out: Path) -> Iterator[str]:
+    """Lines of the manifest, without line ends."""
+    with (out / layout.MANIFEST).open(encoding="utf-8") as file:
+        for line in file:
+            yield line.rstrip("\n")
+
+
+def _stored(path: Path) -> dict[str, Any]:
+    with _files.reported(path):
+        return {"size": path.stat().st_size, "sha256": _files.sha256_of_file(path)}
+
+
+def _root_is_whole(out: Path, name: str, stored: dict[str, Any]) -> bool:
+    try:
+        path = _files.file_inside(out, name)
+        return _files.sha256_of_file(path) == stored["sha256"]
+    except (DataError, OSError):
+        return False

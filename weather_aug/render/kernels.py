@@ -77,6 +77,15 @@ def survival(optical_depth):
 
 
 @compiled
+def _mean_of_thin_layer(heights):
+    """(1 - exp(-h)) / h for small h, where the difference would cancel."""
+    h = heights * np.float32(0.25)
+    h = np.float32(1.0) - h
+    h = np.float32(1.0) - heights * np.float32(1.0 / 3.0) * h
+    return np.float32(1.0) - heights * np.float32(0.5) * h
+
+
+@compiled
 def path_optical_depth(z, ray_x, ray_y, optics, medium, resolved_depth):
     """Optical depth of the air from the camera to depth z along the ray (ray_x, ray_y, 1)."""
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -87,8 +96,8 @@ def path_optical_depth(z, ray_x, ray_y, optics, medium, resolved_depth):
         z = min(np.float32(1000.0) / sine, np.float32(20000.0)) / norm
     path_m = z * norm
     heights = min(max(z * rise * medium.inverse_height_per_m, np.float32(-8.0)), np.float32(80.0))
-    if abs(heights) < np.float32(1e-3):
-        share = one - np.float32(0.5) * heights
+    if abs(heights) < np.float32(0.05):
+        share = _mean_of_thin_layer(heights)
     else:
         share = (one - survival(heights)) / heights
     last = np.int32(resolved_depth.shape[0] - 1)
@@ -247,15 +256,15 @@ def _transmittance_row(depth, ray_x, ray_y, optics, medium, resolved_depth, tau,
         for x in range(width):
             tau[x] += medium.fog_per_m * out[x] * slant[x]
     else:
-        lowest, highest, tiny = np.float32(-8.0), np.float32(80.0), np.float32(1e-3)
+        lowest, highest, thin = np.float32(-8.0), np.float32(80.0), np.float32(0.05)
         for x in range(width):
             rise = optics.up_x * ray_x[x] + rise_y
             heights = out[x] * rise * medium.inverse_height_per_m
             heights = heights if heights > lowest else lowest
             heights = heights if heights < highest else highest
-            away = heights if abs(heights) > tiny else tiny
+            away = heights if abs(heights) >= thin else thin
             share = (one - survival(away)) / away
-            share = share if abs(heights) > tiny else one - np.float32(0.5) * heights
+            share = share if abs(heights) >= thin else _mean_of_thin_layer(heights)
             tau[x] += medium.fog_per_m * share * out[x] * slant[x]
     if medium.precipitation_per_m > zero:
         last = np.float32(resolved_depth.shape[0] - 1)

@@ -1,0 +1,177 @@
+"""render(): its contract, whatever the weather."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from render_scene import make_camera, make_frame
+
+from weather_aug.errors import ArgumentError
+from weather_aug.render.compose import RenderOptions, checked_window, render
+from weather_aug.render.light import Ambience, airlight_from_sky, ambience_of
+from weather_aug.scene.policy import weather_of
+from weather_aug.taxonomy import SKY
+from weather_aug.weather import Weather
+
+AMBIENCE = Ambience(
+    np.eye(3),
+    sky=np.array([0.4, 0.6, 0.9]),
+    middle=np.full(3, 0.2),
+    ground=np.full(3, 0.12),
+    airlight=np.array([0.55, 0.56, 0.57]),
+)
+KINDS = ("clear", "rain", "snow", "fog")
+
+
+def street_frame(width=97, height=61, time_s=1.0):
+    rng = np.random.default_rng(1)
+    camera = make_camera(width, height, velocity=(8.0, 0.5, 0), exposure_s=0.003)
+    depth = rng.uniform(1.5, 80, (height, width)).astype(np.float32)
+    label = rng.integers(0, 19, (height, width), dtype=np.uint8)
+    depth[: height // 4], label[: height // 4] = np.inf, SKY
+    image = rng.integers(0, 255, (height, width, 3), dtype=np.uint8)
+    return make_frame(camera, image, depth, label, time_s)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("severity", [0.02, 0.5, 1.0])
+def test_outputs_are_whole_fresh_and_inputs_untouched(kind, severity):
+    frame = street_frame()
+    arrays = (frame.image, frame.label, frame.depth_m)
+    before = [a.copy() for a in arrays]
+    for array in arrays:
+        array.flags.writeable = False
+    shot = render(frame, weather_of(kind, severity), seed=3, ambience=AMBIENCE)
+    for array, old in zip(arrays, before, strict=True):
+        np.testing.assert_array_equal(array, old)
+    assert (61, 97, 3) == shot.image.shape
+    assert np.isfinite(shot.transmittance).all()
+    assert shot.transmittance.min() >= 0
+    assert shot.transmittance.max() <= 1
+    assert set(np.unique(shot.invalid)) <= {0, 1}
+    assert set(np.unique(shot.label)) <= {*range(19), 255}
+    for out in (shot.image, shot.label, shot.label_full, shot.invalid, shot.transmittance):
+        assert out.flags.c_contiguous
+        assert not any(np.shares_memory(out, a) for a in arrays)
+
+
+def test_clear_weather_gives_the_picture_back():
+    frame = street_frame()
+    windy = Weather(wind_m_per_s=(3.0, 0, 0))
+    for weather in (Weather.clear(), Weather.rain(0.0), Weather.fog(0.0), windy):
+        shot = render(frame, weather, seed=1, ambience=AMBIENCE)
+        np.testing.assert_array_equal(shot.image, frame.image)
+        np.testing.assert_array_equal(shot.label, frame.label)
+        assert (shot.transmittance == 1).all()
+        assert not shot.invalid.any()
+
+
+@pytest.mark.parametrize("kind", KINDS[1:])
+def test_weather_fades_in_from_the_clear_picture(kind):
+    """The smallest severity changes next to nothing: no jump at 0."""
+    frame = street_frame()
+    shot = render(frame, weather_of(kind, 0.005), seed=1, ambience=AMBIENCE)
+    near = np.isfinite(shot.depth)
+    change = np.abs(shot.image.astype(int) - frame.image)[near]
+    assert np.quantile(change, 0.99) <= (4 if kind == "fog" else 1)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    kind=st.sampled_from(KINDS),
+    severity=st.floats(0, 1),
+    seed=st.integers(-(2**63), 2**64 - 1),
+    window=st.tuples(
+        st.integers(0, 50), st.integers(0, 80), st.integers(1, 61), st.integers(1, 97)
+    ),
+)
+def test_a_window_is_a_part_of_the_whole(kind, severity, seed, window):
+    top, left, height, width = window
+    height, width = min(height, 61 - top), min(width, 97 - left)
+    frame, weather = street_frame(), weather_of(kind, severity)
+    options = RenderOptions(2_000)
+    whole = render(frame, weather, seed=seed, ambience=AMBIENCE, options=options)
+    part = render(
+        frame,
+        weather,
+        seed=seed,
+        ambience=AMBIENCE,
+        window=(top, left, height, width),
+        options=options,
+    )
+    for name in ("image", "label", "label_full", "invalid", "transmittance", "depth"):
+        expected = getattr(whole, name)[top : top + height, left : left + width]
+        np.testing.assert_array_equal(expected, getattr(part, name))
+
+
+def test_a_frame_alone_is_the_frame_in_sequence():
+    weather = Weather.snow("heavy")
+    sequence = [
+        render(street_frame(time_s=0.1 * k), weather, seed=5, ambience=AMBIENCE).image
+        for k in range(6)
+    ]
+    alone = render(street_frame(time_s=0.1 * 4), weather, seed=5, ambience=AMBIENCE).image
+    np.testing.assert_array_equal(sequence[4], alone)
+    assert not np.array_equal(sequence[3], sequence[4])
+
+
+def test_seed_chooses_the_particles():
+    frame, weather = street_frame(), Weather.snow("heavy")
+    first, second = (render(frame, weather, seed=s, ambience=AMBIENCE).image for s in (1, 2))
+    assert not np.array_equal(first, second)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (7, 1), (17, 31)])
+@pytest.mark.parametrize("kind", KINDS)
+def test_odd_sizes(shape, kind):
+    frame = street_frame(width=shape[1], height=shape[0])
+    shot = render(frame, weather_of(kind, 1.0), seed=0, ambience=AMBIENCE)
+    assert (*shape, 3) == shot.image.shape
+
+
+def test_depth_that_is_missing_or_nonsense_means_far():
+    frame = street_frame()
+    frame.depth_m[40:45] = np.nan
+    frame.depth_m[45:50] = -3
+    frame.depth_m[50:55] = 0
+    shot = render(frame, Weather.fog("heavy"), seed=0, ambience=AMBIENCE)
+    assert np.isinf(shot.depth[40:55]).all()
+    assert (shot.transmittance[40:55] < 1e-3).all()
+    assert np.isfinite(shot.transmittance).all()
+
+
+def test_refusals():
+    frame = street_frame()
+    for window in ((0, 0, 0, 5), (-1, 0, 5, 5), (0, 0, 62, 5), (0, 90, 5, 10)):
+        with pytest.raises(ArgumentError, match="window"):
+            checked_window(window, 61, 97)
+    without_depth = make_frame(frame.camera, frame.image, 1.0)
+    object.__setattr__(without_depth, "depth_m", None)
+    with pytest.raises(ArgumentError, match="no depth"):
+        render(without_depth, Weather.fog(0.5), seed=0, ambience=AMBIENCE)
+    with pytest.raises(ArgumentError, match="seed"):
+        render(frame, Weather.fog(0.5), seed=2**64, ambience=AMBIENCE)
+    with pytest.raises(ArgumentError, match="max_particles"):
+        RenderOptions(10**9)
+
+
+def test_airlight_is_nearly_grey_and_neither_night_nor_burnt_out():
+    for sky in ([0.01, 0.02, 0.05], [0.3, 0.6, 1.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]):
+        light = airlight_from_sky(np.array(sky))
+        assert 0.3 < light.min()
+        assert light.max() < 0.85
+        assert light.max() / light.min() < 1.25
+
+
+def test_ambience_measures_sky_ground_and_the_rest():
+    camera = make_camera(90, 60)
+    image = np.zeros((60, 90, 3), np.uint8)
+    label = np.full((60, 90), 2, np.uint8)
+    image[:20], label[:20] = (100, 150, 250), SKY
+    image[20:40], image[40:], label[40:] = 90, 40, 0
+    light = ambience_of(make_frame(camera, image, 10.0, label), np.eye(3))
+    assert light.sky[2] > light.sky[0]
+    assert light.middle[0] > light.ground[0]
+    depth = np.where(label == SKY, np.inf, 10.0)
+    unlabelled = ambience_of(make_frame(camera, image, depth), np.eye(3))
+    np.testing.assert_allclose(light.sky, unlabelled.sky)

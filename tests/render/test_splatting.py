@@ -1,0 +1,333 @@
+"""Particles on the picture: energy, shape, occlusion, and agreement with the reference."""
+
+import numpy as np
+import pytest
+from oracles import reference_render as reference
+from render_scene import make_camera, make_frame
+
+from weather_aug.particles import statistics
+from weather_aug.render import compose, kernels
+from weather_aug.render.compose import RenderOptions, render
+from weather_aug.weather import Weather
+
+UP = np.array([0.0, 0, 1])
+CLEAR_AIR = kernels.Medium(*(np.float32(v) for v in (0, 0, 0, 0, 60 / 1024)))
+NOTHING_RESOLVED = np.zeros(1025, np.float32)
+
+
+def project(particles, camera, window=None):
+    particles = np.asarray(particles, np.float32)
+    splats = np.empty((len(particles), 12), np.float32)
+    window = window or (0, 0, camera.height, camera.width)
+    white = np.ones(3, np.float32)
+    optics = compose._optics(camera, UP)
+    count = kernels.project(
+        particles, optics, CLEAR_AIR, NOTHING_RESOLVED, white, white, window, splats
+    )
+    return splats[:count]
+
+
+def transmittance(particles, camera, depth_m=1000.0):
+    """Of particles alone, in clear air."""
+    height, width = camera.height, camera.width
+    window = (0, 0, height, width)
+    splats = project(particles, camera)
+    order, band_starts = kernels.order_by_band(splats, window, -(-height // kernels.BAND_ROWS))
+    through = np.empty((height, width), np.float32)
+    zero = np.float32(0)
+    kernels.compose(
+        np.zeros((height, width, 3), np.uint8),
+        np.full((height, width), depth_m, np.float32),
+        np.zeros((height, width), bool),
+        window,
+        compose._optics(camera, UP),
+        CLEAR_AIR,
+        NOTHING_RESOLVED,
+        np.zeros(256, np.float32),
+        np.eye(3, dtype=np.float32),
+        kernels.Tone(zero, np.float32(1), zero),
+        np.ones(3, np.float32),
+        splats,
+        order,
+        band_starts,
+        compose._falloff(),
+        np.empty((height, width, 3), np.uint8),
+        through,
+        np.empty((height, width), np.float32),
+        np.zeros((height, width), np.uint8),
+    )
+    return through
+
+
+def discs(camera, count, diameter_m, near_m, far_m, seed):
+    """Still discs, uniform in the padded frustum."""
+    rng = np.random.default_rng(seed)
+    z = (near_m**3 + rng.random(count) * (far_m**3 - near_m**3)) ** (1 / 3)
+    (fx, fy), (cx, cy) = camera.focal_px, camera.principal_px
+    x = (rng.uniform(-2, camera.width + 1, count) - cx) / fx * z
+    y = (rng.uniform(-2, camera.height + 1, count) - cy) / fy * z
+    still = np.zeros((count, 3))
+    return np.column_stack([x, y, z, still, np.full(count, diameter_m)])
+
+
+def frustum_m3(camera, near_m, far_m):
+    (fx, fy) = camera.focal_px
+    return (camera.width + 3) * (camera.height + 3) / (fx * fy) * (far_m**3 - near_m**3) / 3
+
+
+@pytest.mark.parametrize("tau", [0.5, 1.0, 2.0])
+def test_poisson_discs_obey_beer_and_lambert(tau):
+    """Mean transmittance of randomly placed discs is exp(-n A z) (Campbell's theorem)."""
+    camera = make_camera(width=200, height=120)
+    near_m, far_m, diameter_m = 2.0, 10.0, 0.03
+    area = np.pi / 4 * diameter_m**2
+    density = tau / (area * (far_m - near_m))
+    count = round(density * frustum_m3(camera, near_m, far_m))
+    mean = np.mean(
+        [
+            transmittance(discs(camera, count, diameter_m, near_m, far_m, seed), camera).mean()
+            for seed in range(3)
+        ]
+    )
+    # Paths are longer off the axis, by 1 / cos of the angle.
+    norm = np.sqrt(1 + (reference.rays(camera) ** 2).sum(-1))
+    assert mean == pytest.approx(np.exp(-tau * norm).mean(), rel=0.03)
+
+
+def test_transmittance_does_not_depend_on_resolution():
+    """Small discs, a few tenths of a pixel wide, at full, half and quarter resolution."""
+    full = make_camera(width=480, height=288)
+    near_m, far_m, diameter_m, tau = 1.0, 12.0, 0.006, 0.467
+    density = tau / (np.pi / 4 * diameter_m**2 * (far_m - near_m))
+    count = round(density * frustum_m3(full, near_m, far_m))
+    particles = discs(full, count, diameter_m, near_m, far_m, seed=1)
+    means = [transmittance(particles, full.resized(480 // k, 288 // k)).mean() for k in (1, 2, 4)]
+    assert max(means) - min(means) < 0.02 * means[0]
+    norm = np.sqrt(1 + (reference.rays(full) ** 2).sum(-1))
+    assert means[0] == pytest.approx(np.exp(-tau * norm).mean(), rel=0.03)
+
+
+def test_without_compensation_resolution_would_change_the_weather():
+    """The planted fault: stock dilation makes the same discs several times more opaque."""
+    camera = make_camera(width=60, height=36)
+    particles = discs(camera, 1_000, 0.006, 3.0, 10.0, seed=1)
+    dark = {}
+    for compensate in (True, False):
+        light, through = np.zeros((36, 60, 3)), np.ones((36, 60))
+        depth = np.full((36, 60), 100.0)
+        reference.splat(
+            light,
+            through,
+            depth,
+            particles,
+            camera,
+            lambda _: np.ones(3),
+            compensate=compensate,
+        )
+        dark[compensate] = -np.log(through).mean()
+    assert dark[False] > 5 * dark[True]
+
+
+def test_opacity_adds_up_to_the_silhouette():
+    """Opacity integrated over the picture is the disc's area in pixels, streaked or not."""
+    camera = make_camera(width=300, height=300, focal_px=800.0, aperture_m=0.0)
+    area_px = np.pi / 4 * (0.004 * 800 / 3.0) ** 2
+    for velocity in ((0, 0, 0), (3.0, 5.0, 0), (0, 9.0, -12.0)):
+        for exposure_s in (0.001, 0.005):
+            moved = make_camera(300, 300, 800.0, exposure_s=exposure_s, aperture_m=0.0)
+            particle = [[0.01, -0.02, 3.0, *velocity, 0.004]]
+            missing = 1 - transmittance(particle, moved)
+            assert missing.sum() == pytest.approx(area_px, rel=0.02)
+    assert (1 - transmittance([[0, 0, 3.0, 0, 0, 0, 0.004]], camera)).max() > 0.15
+
+
+@pytest.mark.parametrize("exposure_s", [0.002, 0.005, 0.02])
+def test_streak_opacity_follows_the_exposure(exposure_s):
+    """A 2 mm drop fades as its streak grows; the sum across the streak is known in closed form.
+
+    The streak is a Gaussian of the sweep's variance L^2 / 12, so its middle is 1.38 times above the
+    flat (pi/4) D / (L + D) of the same area.
+    """
+    diameter_m, speed = 0.002, 6.54
+    camera = make_camera(64, 2000, 4000.0, exposure_s=exposure_s, aperture_m=0.0)
+    missing = 1 - transmittance([[0, 0, 1.0, 0, speed, 0, diameter_m]], camera)
+    length_m = exposure_s * speed
+    across = missing[1000].sum() / (diameter_m * 4000)
+    spread_m = np.sqrt(2 * np.pi * (length_m**2 / 12 + diameter_m**2 / 8))
+    # The cut of the faint ends moves their share to the middle, most where all is faint.
+    assert across == pytest.approx(np.pi / 4 * diameter_m / spread_m, rel=0.13)
+
+
+def test_streaks_point_where_the_drop_moves_and_radiate_from_the_heading():
+    camera = make_camera(400, 300, 400.0, exposure_s=0.004)
+    rng = np.random.default_rng(5)
+    position = np.column_stack(
+        [rng.uniform(-2, 2, 200), rng.uniform(-1.4, 1.4, 200), rng.uniform(2.5, 6, 200)]
+    )
+    relative = np.array([0.6, 0.4, -15.0])  # drops rush at a driving camera
+    particles = np.column_stack([position, np.broadcast_to(relative, (200, 3)), np.full(200, 2e-3)])
+    splats = project(particles, camera).astype(float)
+    focus = 400 * relative[:2] / relative[2] + np.array(camera.principal_px)
+    for u, v, a, b, c in splats[:, :5]:
+        values, vectors = np.linalg.eigh(np.array([[a, b], [b, c]]))
+        if values[1] < 30 * values[0]:
+            continue
+        along = vectors[:, 0]  # the conic is the inverse covariance
+        outward = np.array([u, v]) - focus
+        offset = abs(along[0] * outward[1] - along[1] * outward[0])
+        assert offset < 2.0
+
+
+def test_a_parked_camera_sees_rain_lean_with_the_wind():
+    camera = make_camera(400, 300, 400.0, exposure_s=0.005)
+    wind, fall = 3.0, 6.5
+    splat = project([[0.0, 0.0, 3.0, wind, fall, 0.0, 0.002]], camera)[0].astype(float)
+    a, b, c = splat[2:5]
+    along = np.linalg.eigh(np.array([[a, b], [b, c]]))[1][:, 0]
+    assert abs(np.degrees(np.arctan(along[0] / along[1]) - np.arctan(wind / fall))) < 0.1
+
+
+def test_a_turning_camera_streaks_still_particles():
+    camera = make_camera(
+        400, 300, 400.0, exposure_s=0.01, angular_velocity_rad_per_s=np.array([0.0, 0.5, 0.0])
+    )
+    splat = project([[0.0, 0.0, 5.0, 0, 0, 0, 0.002]], camera)[0].astype(float)
+    still = project([[0.0, 0.0, 5.0, 0, 0, 0, 0.002]], make_camera(400, 300, 400.0))[0]
+    assert splat[2] < 0.5 * still[2]  # wider along u
+    assert splat[4] == pytest.approx(still[4], rel=1e-3)
+
+
+def test_near_flakes_are_bigger_than_far_ones():
+    camera = make_camera(400, 300, 400.0, aperture_m=0.0)
+    sizes = [(1 - transmittance([[0, 0, z, 0, 0, 0, 0.01]], camera)).sum() for z in (1.0, 2.0, 4.0)]
+    np.testing.assert_allclose(np.divide(sizes[:2], sizes[1:]), 4, rtol=0.05)
+
+
+def test_surfaces_hide_the_particles_behind_them():
+    camera = make_camera(60, 60, 200.0)
+    particle = [[0, 0, 5.0, 0, 0, 0, 0.02]]
+    assert transmittance(particle, camera, depth_m=4.8).min() == 1.0
+    assert transmittance(particle, camera, depth_m=5.2).min() < 0.9
+    half = 1 - transmittance(particle, camera, depth_m=5.0)
+    whole = 1 - transmittance(particle, camera, depth_m=9.0)
+    np.testing.assert_allclose(half, 0.5 * whole, atol=1e-6)
+
+
+@pytest.mark.parametrize("weather", [Weather.rain("heavy"), Weather.snow("moderate")])
+def test_whole_frame_agrees_with_the_reference(weather, ambience):
+    """PSNR of at least 55 dB and at most 4 levels, through all stages."""
+    rng = np.random.default_rng(9)
+    camera = make_camera(200, 120, 400.0, velocity=(9.0, 0, 0), exposure_s=0.001)
+    depth = rng.uniform(3, 60, (120, 200)).astype(np.float32)
+    image = rng.integers(20, 200, (120, 200, 3), dtype=np.uint8)
+    frame = make_frame(camera, image, depth)
+    weather = Weather.from_dict(weather.to_dict() | {"overcast": 0.0})
+    options = RenderOptions(2_000)
+    shot = render(frame, weather, seed=4, ambience=ambience, options=options)
+
+    (field,) = compose._fields(weather, 4, ambience)
+    resolved = field.resolve(camera, options.max_particles)
+    particles = field.particles(camera, frame.time_s, resolved, (0, 0, 120, 200))
+    bins = len(resolved.optical_depth) - 1
+
+    def carried(z):
+        return resolved.optical_depth[np.minimum(z / 60 * bins, bins).astype(int)]
+
+    def air(z, ray):
+        extinction = field.population.extinction_per_m
+        up = np.array([0, -1.0, 0])
+        haze = weather.mist_per_km * 1e-3
+        return np.exp(-optical_depth(z, ray, up, 0.0, 0.0, haze, extinction, carried))
+
+    optical_depth = reference.optical_depth
+    colour = {"rain": compose.rain_colour, "snow": compose.snow_colour}[field.population.kind]
+
+    def colour_at(position):
+        ray = position[:2] / position[2]
+        through = air(position[2], ray)
+        return through * colour(ambience) + (1 - through) * ambience.airlight
+
+    through = air(depth.astype(float), reference.rays(camera))
+    light = through[..., None] * reference.linear(image)
+    light += (1 - through[..., None]) * ambience.airlight
+    expected_through = through.copy()
+    reference.splat(light, expected_through, depth, particles.astype(float), camera, colour_at)
+    expected = np.round(reference.srgb(light))
+    error = expected - shot.image
+    assert len(particles) > 300
+    assert np.abs(error).max() <= 4
+    assert 10 * np.log10(255**2 / np.mean(error**2)) > 55
+    np.testing.assert_allclose(expected_through, shot.transmittance, atol=0.02)
+
+
+def test_explicit_and_residual_are_the_whole_at_any_budget(ambience):
+    """Mean transmittance of a wall under dense snow is Beer-Lambert's for three budgets."""
+    camera = make_camera(200, 120, exposure_s=0.002)
+    weather = Weather(snow_mm_per_h=4.0)
+    extinction = statistics.snow_extinction_per_m(4.0)
+    for depth_m in (12.0, 30.0):
+        frame = make_frame(camera, 60, depth_m)
+        norm = np.sqrt(1 + (reference.rays(camera) ** 2).sum(-1))
+        expected = np.exp(-extinction * depth_m * norm).mean()
+        for budget in (0, 2_000, 40_000):
+            mean = np.mean(
+                [
+                    render(
+                        frame,
+                        weather,
+                        seed=seed,
+                        ambience=ambience,
+                        options=RenderOptions(budget),
+                    ).transmittance.mean()
+                    for seed in range(3)
+                ]
+            )
+            assert mean == pytest.approx(expected, rel=0.01)
+
+
+def test_mean_transmittance_is_the_same_at_every_resolution(ambience):
+    weather = Weather(snow_mm_per_h=4.0)
+    full = make_camera(480, 288, exposure_s=0.002)
+    means = []
+    for k in (1, 2, 4):
+        camera = full.resized(480 // k, 288 // k)
+        frame = make_frame(camera, 60, 25.0)
+        shots = [render(frame, weather, seed=s, ambience=ambience) for s in range(3)]
+        means.append(np.mean([shot.transmittance.mean() for shot in shots]))
+    assert max(means) - min(means) < 0.02 * means[0]
+
+
+@pytest.mark.parametrize("kind", ["rain", "snow"])
+def test_particles_never_brighten_a_bright_sky(kind, ambience):
+    """A layer over a uniform sky: at most a level darker on the mean, nowhere brighter."""
+    camera = make_camera(160, 96, exposure_s=0.002)
+    sky_level = np.round(reference.srgb(ambience.sky)).astype(np.uint8)
+    frame = make_frame(camera, sky_level, 40.0)
+    weather = Weather(**{f"{kind}_mm_per_h": 2.0})
+    without = render(frame, weather, seed=2, ambience=ambience, options=RenderOptions(0))
+    with_particles = render(frame, weather, seed=2, ambience=ambience)
+    change = with_particles.image.astype(int) - without.image
+    assert change.min() < -1
+    # Where particles are resolved less is veil, and the veil is a little darker than this sky.
+    assert change.max() <= 1
+    if kind == "rain":
+        assert change.mean() >= -1
+
+
+def test_drops_and_flakes_are_darker_than_the_sky_and_brighter_than_a_black_wall(ambience):
+    for colour in (compose.rain_colour(ambience), compose.snow_colour(ambience)):
+        assert (colour < 0.98 * ambience.sky + 1e-9).all()
+        assert (colour > ambience.ground).all()
+
+
+def test_bands_do_not_show(ambience):
+    """A picture is the same whether a row is the first or the last of its band."""
+    camera = make_camera(96, 80, exposure_s=0.003)
+    frame = make_frame(camera, 60, 30.0)
+    weather = Weather.snow("heavy")
+    whole = render(frame, weather, seed=1, ambience=ambience)
+    for top in (1, 7, 15, 16, 40):
+        part = render(frame, weather, seed=1, ambience=ambience, window=(top, 3, 33, 80))
+        np.testing.assert_array_equal(whole.image[top : top + 33, 3:83], part.image)
+        np.testing.assert_array_equal(whole.transmittance[top : top + 33, 3:83], part.transmittance)
+        np.testing.assert_array_equal(whole.invalid[top : top + 33, 3:83], part.invalid)

@@ -246,7 +246,6 @@ def test_another_job_is_refused_by_its_first_differing_field(
         "seed": {"seed": 4},
         "count": {"count": 11},
         "policy": {"policy": replace(POLICY, falling=0.1)},
-        "scenes": {"scene_digests": ("0" * 64,)},
     }
     for field, change in changes.items():
         with pytest.raises(ConflictError, match=f"its {field} is"):
@@ -256,6 +255,13 @@ def test_another_job_is_refused_by_its_first_differing_field(
     after = tree_of(out)
     after.pop(".export/lock", None), before.pop(".export/lock", None)
     assert after == before
+
+
+def test_another_scene_is_another_job(plan: ExportPlan, tmp_path: Path) -> None:
+    export(plan, tmp_path / "out")
+    changed = WeatherScene.build(TinyClip(tint=1), tmp_path / "scene")
+    with pytest.raises(ConflictError, match="its scenes is"):
+        export(plan_export([changed], POLICY, count=10, seed=3), tmp_path / "out")
 
 
 def test_an_output_in_use_names_its_holder(plan: ExportPlan, out: Path) -> None:
@@ -309,6 +315,6 @@ def test_unusable_outputs_are_refused_before_the_first_render(
 def test_an_unreadable_scene_is_named(tmp_path: Path) -> None:
     scene = WeatherScene.build(TinyClip(), tmp_path / "scene")
     plan = plan_export([scene], POLICY, count=4, seed=0)
-    (scene.path / "frames" / f"{plan.item(0).key}.png").unlink()
-    with pytest.raises(SceneError, match=r"scene cannot be read: No such file"):
-        export(plan, tmp_path / "out")
+    picture = scene.path / "frames" / f"{plan.item(1).key}.png"
+    with pytest.raises(SceneError, match=r"front.png cannot be read: No such file"):
+        export(plan, tmp_path / "out", on_sample=lambda _: picture.unlink())

@@ -128,7 +128,7 @@ def test_a_scene_whose_name_leads_elsewhere_is_refused(tmp_path: Path, name: str
     scene = WeatherScene.build(TinyClip(frames=1), tmp_path / "scene")
     manifest = scene.path / "scene.json"
     manifest.write_text(manifest.read_text().replace('"tiny"', json.dumps(name)))
-    with pytest.raises(SceneError, match="scene name"):
+    with pytest.raises(SceneError, match="must be letters"):
         plan_export([WeatherScene.load(scene.path)], POLICY, count=1, seed=0)
 
 
@@ -138,4 +138,4 @@ def test_a_scene_rebuilt_since_is_noticed(tmp_path: Path) -> None:
     plan.check_scenes()
     WeatherScene.build(TinyClip(frames=2), tmp_path / "scene", overwrite=True)
     with pytest.raises(ConflictError, match="rebuilt"):
-        pickle.loads(pickle.dumps(plan)).check_scenes()
+        plan.check_scenes()

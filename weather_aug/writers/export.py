@@ -72,7 +72,8 @@ def export(
             completion.
 
     Raises:
-        ConflictError: If another process exports to `out`, or it holds another job or other files.
+        ConflictError: If another process exports to `out`, it holds another job or other files, or
+            a scene was rebuilt since it was planned.
         OutputError: If `out` lies inside a scene, is a file, or cannot be written.
         SceneError: If a scene cannot be read.
         IntegrityError: If items are missing because they killed their workers.
@@ -80,16 +81,17 @@ def export(
     start_s = time.monotonic()
     finite("workers", workers, 0, MAX_WORKERS)
     out = check_output(Path(out), [scene.path for scene in plan.scenes])
+    plan.check_scenes()
     rendered = damaged = 0
     with exclusive(out):
         _remove_leftovers(out)
-        if _needs_work(plan, out, verify):
-            with Journal(out / layout.JOURNAL, plan, out) as journal:
+        contents = _finished(plan, out, verify, progress)
+        if contents is None:
+            with Journal(out / layout.JOURNAL, plan, out, progress=progress) as journal:
                 damaged = journal.damaged
                 _make_folders(plan, out)
                 rendered = _render(plan, out, journal, int(workers), progress, on_sample)
-                finish(plan, out, journal)
-        contents = layout.read_contents(out)
+                contents = finish(plan, out, journal)
         with _files.reported(out):
             for name in (layout.QUARANTINE, layout.JOURNAL):
                 (out / name).unlink(missing_ok=True)
@@ -106,30 +108,35 @@ def export(
     )
 
 
-def _needs_work(plan: ExportPlan, out: Path, verify: bool) -> bool:
-    """Whether something is to be rendered or written; if so there is a journal of this job."""
+def _finished(plan: ExportPlan, out: Path, verify: bool, progress: bool) -> dict[str, Any] | None:
+    """`export.json` of a whole export, or None; then there is a journal of the job to continue."""
     path = out / layout.JOURNAL
     if not (out / layout.CONTENTS).exists():
         if path.exists():
             _check_job(plan, job_of(path), out)
         else:
             write_journal(path, plan.job)
-        return True
+        return None
+    contents = _contents(out)
+    _check_job(plan, contents["job"], out)
+    if is_finished_whole(out, contents, digests=verify, progress=progress):
+        return contents
+    write_journal(path, plan.job, usable_lines(out, contents))
+    with _files.reported(out):
+        (out / layout.CONTENTS).unlink()
+        _files.sync_folder(out)
+    return None
+
+
+def _contents(out: Path) -> dict[str, Any]:
     try:
-        contents = layout.read_contents(out)
+        with _files.reported(out / layout.CONTENTS):
+            return layout.read_contents(out)
     except (DataError, IntegrityError) as error:
         raise IntegrityError(
             f"{error}; the job of this export is unknown, so it cannot be repaired: remove the "
             "folder and export again"
         ) from None
-    _check_job(plan, contents["job"], out)
-    if is_finished_whole(out, contents, digests=verify):
-        return False
-    write_journal(path, plan.job, usable_lines(out, contents))
-    with _files.reported(out):
-        (out / layout.CONTENTS).unlink()
-        _files.sync_folder(out)
-    return True
 
 
 def _check_job(plan: ExportPlan, found: Any, out: Path) -> None:

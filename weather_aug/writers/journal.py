@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -82,7 +83,7 @@ class Journal:
     It keeps one offset an item in memory, not the lines.
     """
 
-    def __init__(self, path: Path, plan: ExportPlan, out: Path) -> None:
+    def __init__(self, path: Path, plan: ExportPlan, out: Path, *, progress: bool = False) -> None:
         """Open a journal; lines whose files are not whole are dropped from it.
 
         Raises:
@@ -90,15 +91,16 @@ class Journal:
         """
         self.path = path
         self._offsets = np.full(plan.count, -1, np.int64)
-        lines = _Kept(path, plan, out)
+        self._unsynced = 0
+        lines = _Kept(path, plan, out, progress)
         write_journal(path, plan.job, lines)
         self.damaged = lines.dropped
-        with _files.reported(path):
+        with _files.reported(path), ExitStack() as opened:
             # Unbuffered: a line that was appended survives the death of this process.
-            self._file = path.open("ab", buffering=0)
-            self._reader = path.open("rb")
-        self._index_lines()
-        self._unsynced = 0
+            self._file = opened.enter_context(path.open("ab", buffering=0))
+            self._reader = opened.enter_context(path.open("rb"))
+            self._index_lines()
+            self._opened = opened.pop_all()
 
     @property
     def committed(self) -> int:
@@ -154,8 +156,7 @@ class Journal:
             if error is None:
                 raise
         finally:
-            self._reader.close()
-            self._file.close()
+            self._opened.close()
 
     def _sync(self) -> None:
         os.fsync(self._file.fileno())
@@ -174,15 +175,17 @@ class Journal:
 class _Kept:
     """The lines of an interrupted journal whose files are whole; counts the others."""
 
-    def __init__(self, path: Path, plan: ExportPlan, out: Path) -> None:
-        self._path, self._plan, self._out = path, plan, out
+    def __init__(self, path: Path, plan: ExportPlan, out: Path, progress: bool) -> None:
+        self._path, self._plan, self._out, self._progress = path, plan, out, progress
         self.dropped = 0
 
     def __iter__(self) -> Iterator[str]:
+        from tqdm.auto import tqdm
+
         seen = np.zeros(self._plan.count, bool)
         with self._path.open("rb") as file:
             file.readline()
-            for line in file:
+            for line in tqdm(file, desc="verify", unit="sample", disable=not self._progress):
                 text = unsealed(line)
                 index = None if text is None else self._whole_item(text)
                 if text is None or index is None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from weather_aug import _files
-from weather_aug.errors import IntegrityError, printable
+from weather_aug.errors import DataError, IntegrityError, printable
 
 FORMAT = "weather_aug export"
 VERSION = 1
@@ -51,14 +51,19 @@ def read_contents(out: Path) -> dict[str, Any]:
     """Read and check an export's `export.json`.
 
     Raises:
-        DataError: If it is not readable JSON.
+        DataError: If it is too large or not JSON.
         IntegrityError: If it is not an export's, or its own digest does not match.
+        OSError: If it cannot be read.
     """
     path = out / CONTENTS
-    contents = _files.read_json(path)
+    with path.open("rb") as file:
+        data = file.read(_files.MAX_JSON_BYTES + 1)
+    if len(data) > _files.MAX_JSON_BYTES:
+        raise DataError(f"{printable(path, 200)} is larger than {_files.MAX_JSON_BYTES} bytes")
+    contents = _files.parse_json(data.decode(errors="replace"), str(path))
     if not isinstance(contents, dict) or contents.get("format") != FORMAT:
         raise IntegrityError(f"{printable(path, 200)} is not of a {FORMAT}")
     contents.pop("sha256", None)
-    if path.read_bytes() != sealed_contents(contents):
+    if data != sealed_contents(contents):
         raise IntegrityError(f"{printable(path, 200)} has changed since it was written")
     return contents

@@ -41,6 +41,8 @@ def exclusive(out: Path) -> Iterator[None]:
                 for file in state.iterdir():
                     file.unlink()
                 state.rmdir()
+        # Closing is not enough if this process was forked meanwhile: the child has the lock too.
+        fcntl.flock(descriptor, fcntl.LOCK_UN)
         os.close(descriptor)
 
 

@@ -16,8 +16,11 @@ from weather_aug.writers.journal import Journal, is_whole
 from weather_aug.writers.plan import ExportPlan
 
 
-def finish(plan: ExportPlan, out: Path, journal: Journal) -> None:
+def finish(plan: ExportPlan, out: Path, journal: Journal) -> dict[str, Any]:
     """Write manifest, class statistics and `export.json` from a journal of all items.
+
+    Returns:
+        The fields of `export.json`.
 
     Raises:
         OutputError: If a file cannot be written.
@@ -49,18 +52,28 @@ def finish(plan: ExportPlan, out: Path, journal: Journal) -> None:
         "files": {name: _stored(out / name) for name in names},
     }
     _files.write_whole(out / layout.CONTENTS, layout.sealed_contents(contents))
+    return contents
 
 
-def is_finished_whole(out: Path, contents: dict[str, Any], *, digests: bool) -> bool:
+def is_finished_whole(
+    out: Path, contents: dict[str, Any], *, digests: bool, progress: bool = False
+) -> bool:
     """Whether all files of a finished export are there with their sizes and (`digests`) bytes.
 
     The few files at the root are compared by digest in any case.
     """
+    from tqdm.auto import tqdm
+
     if not all(_root_is_whole(out, name, file) for name, file in contents["files"].items()):
         return False
-    return all(
-        is_whole(out, json.loads(line)["files"], digests=digests) for line in manifest_lines(out)
+    lines = tqdm(
+        manifest_lines(out),
+        total=contents["samples"],
+        desc="verify",
+        unit="sample",
+        disable=not progress,
     )
+    return all(is_whole(out, json.loads(line)["files"], digests=digests) for line in lines)
 
 
 def usable_lines(out: Path, contents: dict[str, Any]) -> Iterator[str]:

@@ -17,7 +17,7 @@ import weather_aug
 from weather_aug import _files
 from weather_aug._keys import check_seed, key_of, uniforms
 from weather_aug.clip.types import FrameKey
-from weather_aug.errors import ArgumentError, ConflictError, SceneError
+from weather_aug.errors import ArgumentError, ConflictError, printable
 from weather_aug.render.compose import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene import store
 from weather_aug.scene.policy import WeatherDraw, WeatherPolicy
@@ -132,16 +132,16 @@ class ExportPlan:
         return list(found)
 
     def check_scenes(self) -> None:
-        """Refuse scenes that are not those the plan was made for.
+        """Read the scenes' manifests anew; refuse those that the plan was not made for.
 
         Raises:
             ConflictError: If a scene was rebuilt since.
         """
         for scene, digest in zip(self.scenes, self.scene_digests, strict=True):
-            if scene.digest != digest:
+            if WeatherScene(scene.path).digest != digest:
                 raise ConflictError(
-                    f"scene {scene.path} was rebuilt while it was being exported; export again, "
-                    "to another folder"
+                    f"scene {printable(scene.path, 200)} was rebuilt since the export was planned; "
+                    "export it again, to another folder"
                 )
 
     def _frame(self, index: int) -> tuple[int, store.FrameRecord]:
@@ -179,19 +179,13 @@ def plan_export(
 
     Raises:
         ArgumentError: If there are no scenes, or count or seed are out of range.
-        SceneError: If a scene has no frames, or its names cannot be file names.
+        SceneError: If a scene cannot be read.
     """
     scenes = tuple(scenes)
     if not scenes:
         raise ArgumentError("scenes is empty; give at least one scene to export")
     if not 1 <= check_seed("count", count) <= MAX_COUNT:
         raise ArgumentError(f"count must be in [1, {MAX_COUNT}], got {count!r}")
-    for scene in scenes:
-        store.check_name("scene name", scene.name)
-        for camera in scene.cameras:
-            store.check_name("camera name", camera)
-        if not scene.manifest.frames:
-            raise SceneError(f"scene {scene.path} has no frames; there is nothing to export")
     digests = tuple(scene.digest for scene in scenes)
     return ExportPlan(scenes, policy, int(count), check_seed("seed", seed), options, digests)
 

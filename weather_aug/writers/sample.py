@@ -33,18 +33,12 @@ def render_recipe(scene: WeatherScene, recipe: Mapping[str, Any]) -> RenderedFra
             f"{scene.digest[:12]}…, the recipe's {printable(recipe['scene_digest'], 12)}"
         )
     key = FrameKey(recipe["time_index"], recipe["camera"])
-    try:
-        return scene.render(
-            key,
-            Weather.from_dict(recipe["weather"]),
-            seed=recipe["seed"],
-            options=RenderOptions(**recipe["options"]),
-        )
-    except OSError as error:
-        cause = error.strerror or str(error)
-        raise SceneError(
-            f"frame {key} of {printable(scene.path, 200)} cannot be read: {cause}"
-        ) from error
+    return scene.render(
+        key,
+        Weather.from_dict(recipe["weather"]),
+        seed=recipe["seed"],
+        options=RenderOptions(**recipe["options"]),
+    )
 
 
 def encoded_parts(shot: RenderedFrame) -> dict[str, bytes]:

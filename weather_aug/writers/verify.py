@@ -29,6 +29,8 @@ def verify_export(out: Path) -> list[str]:
         contents = layout.read_contents(out)
     except (DataError, IntegrityError) as error:
         return [str(error)]
+    except OSError as error:
+        return [f"{printable(out / layout.CONTENTS, 200)} cannot be read: {error.strerror}"]
     problems: list[str] = []
     try:
         expected = {layout.CONTENTS}

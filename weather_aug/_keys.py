@@ -54,7 +54,7 @@ def check_seed(name: str, value: int) -> int:
     """Return `value` as a Python int, or refuse it by `name`."""
     try:
         number = value.__index__()
-    except AttributeError:
+    except (AttributeError, TypeError):
         raise ArgumentError(f"{name} must be an integer, got {type(value).__name__}") from None
     if isinstance(value, bool) or not _LOW <= number < _HIGH:
         raise ArgumentError(f"{name} must be an integer in [-2**63, 2**64), got {value!r}")

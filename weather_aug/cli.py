@@ -12,6 +12,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
+from weather_aug import _files
 from weather_aug.errors import ArgumentError, IntegrityError, WeatherAugError, printable
 
 
@@ -20,7 +21,7 @@ class Build:
     """Precompute a clip into a scene folder; run again to continue interrupted work."""
 
     clip: Positional[str]
-    """Clip to read, "scheme:path?option=value&…" (kitti-odometry, kitti-raw, dgp, folder, street)."""
+    """Clip, "scheme:path?option=value&…" (kitti-odometry, kitti-raw, dgp, folder, street)."""
     out: Path
     """Scene folder to make."""
     editor: str = "physical"
@@ -116,6 +117,7 @@ class Sweep:
 
     def run(self) -> None:
         """Render the grid and name its file."""
+        from weather_aug.clip.types import FrameKey
         from weather_aug.scene.scene import WeatherScene
         from weather_aug.view.sheet import sweep, write_png
 
@@ -128,8 +130,6 @@ class Sweep:
                 f"{', '.join(scene.cameras)}"
             )
         time_index = times[len(times) // 2] if self.time is None else self.time
-        from weather_aug.clip.types import FrameKey
-
         key = FrameKey(time_index, camera)
         write_png(self.out, sweep(scene, key, seed=self.seed, tile_width=self.tile_width))
         _say(str(self.out))
@@ -162,7 +162,8 @@ class Export:
         """Export and say what was written."""
         from weather_aug.scene.policy import WeatherPolicy
         from weather_aug.scene.scene import WeatherScene
-        from weather_aug.writers.export import export, plan_export
+        from weather_aug.writers.export import export
+        from weather_aug.writers.plan import plan_export
 
         scenes = [WeatherScene.load(path) for path in self.scenes]
         policy = WeatherPolicy(self.types, self.severity, self.falling)
@@ -213,7 +214,8 @@ class Demo:
         scene_folder = self.out / "scene"
         if not scene_folder.exists():
             _say("1/3 build a scene of the procedural street (three cameras)")
-            self.out.mkdir(parents=True, exist_ok=True)
+            with _files.reported(self.out):
+                self.out.mkdir(parents=True, exist_ok=True)
             clip = open_clip(f"street:?frames={self.frames}")
             WeatherScene.build(clip, scene_folder, progress=_to_people())
         scene = WeatherScene.load(scene_folder)

@@ -187,7 +187,8 @@ class Weather:
             wetness=1 - (1 - a.wetness) * (1 - b.wetness),
             snow_cover=1 - (1 - a.snow_cover) * (1 - b.snow_cover),
             overcast=max(a.overcast, b.overcast),
-            wind_m_per_s=max(a.wind_m_per_s, b.wind_m_per_s, key=lambda wind: math.hypot(*wind)),
+            # Of two equally strong winds the order must not decide.
+            wind_m_per_s=max(a.wind_m_per_s, b.wind_m_per_s, key=lambda w: (math.hypot(*w), w)),
         )
 
     @property
@@ -229,8 +230,8 @@ class Weather:
         """
         try:
             state = json.loads(text)
-        except ValueError as error:
-            raise ArgumentError(f"not a Weather in JSON: {error}") from None
+        except (ValueError, RecursionError) as error:
+            raise ArgumentError(f"not a Weather in JSON: {printable(error)}") from None
         return cls.from_dict(state)
 
 
@@ -343,7 +344,7 @@ def _fog_inverse_height(s: float) -> float:
 
 def _build(cls: type[Weather], state: dict[str, Any], overrides: dict[str, Any]) -> Weather:
     known = {f.name for f in fields(cls)}
-    unknown = sorted(set(overrides) - known)
+    unknown = sorted(set(overrides) - known, key=str)
     if unknown:
         raise ArgumentError(
             f"Weather has no field {printable(unknown[0])}; its fields are "

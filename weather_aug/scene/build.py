@@ -44,7 +44,8 @@ def build(
     """Write the scene of `clip` to the folder `out`, which appears only when it is complete.
 
     Work in progress stands in `out` + ".building" with a journal of finished frames; the same call
-    again continues it. Bad input removes it: there is nothing to continue.
+    again continues it, after making the first finished frame once more to see that the clip is
+    still the same. Bad input removes it: there is nothing to continue.
 
     Args:
         clip: The drive; every frame needs depth.
@@ -57,27 +58,26 @@ def build(
     Raises:
         ArgumentError: If the editor or a weather is unknown.
         ConflictError: If `out` exists.
-        ClipError: If the clip is empty or a frame has no depth.
+        ClipError: If the clip is empty or too long, or a frame has no depth.
+        SceneError: If a name cannot stand in a file name, or a frame cannot be stored.
         OutputError: If the output cannot be written.
     """
     _check(clip, out, editor, weathers, overwrite)
     work = out.with_name(out.name + UNFINISHED_SUFFIX)
     try:
-        with _files.reported(work):
-            (work / store.FRAMES).mkdir(parents=True, exist_ok=True)
-        entries, files = _write_frames(clip, work, _fingerprint(clip), progress)
+        entries, files = _write_frames(clip, work, progress)
+        content = {
+            "name": clip.name,
+            "editor": editor,
+            "weathers": list(weathers),
+            "axes_world": street_axes(entries, clip.up_world).tolist(),
+            "airlight": np.median([entry.pop("airlight") for entry in entries], axis=0).tolist(),
+            "frames": entries,
+            "files": files,
+        }
     except DataError:
         shutil.rmtree(work, ignore_errors=True)
         raise
-    content = {
-        "name": store.check_name("clip name", clip.name),
-        "editor": editor,
-        "weathers": list(weathers),
-        "axes_world": street_axes(entries, clip.up_world).tolist(),
-        "airlight": np.median([entry.pop("airlight") for entry in entries], axis=0).tolist(),
-        "frames": entries,
-        "files": files,
-    }
     _files.write_whole(work / store.MANIFEST, store.manifest_bytes(content))
     with _files.reported(out):
         (work / JOURNAL).unlink(missing_ok=True)
@@ -112,10 +112,7 @@ def _check(clip: Clip, out: Path, editor: str, weathers: Sequence[str], overwrit
     unknown = sorted(set(weathers) - set(TYPES))
     if unknown:
         raise ArgumentError(f"weather {printable(unknown[0])!r} is not one of {', '.join(TYPES)}")
-    if not clip.keys:
-        raise ClipError(f"clip {clip.name} has no frames; there is nothing to build")
-    for camera in clip.cameras:
-        store.check_name("camera name", camera)
+    _check_clip(clip)
     if out.exists() and not (overwrite and (out / store.MANIFEST).is_file()):
         raise ConflictError(
             f"{printable(out, 200)} exists; choose another folder, or pass overwrite to replace a "
@@ -125,28 +122,41 @@ def _check(clip: Clip, out: Path, editor: str, weathers: Sequence[str], overwrit
         raise OutputError(f"the folder {printable(out.absolute().parent, 200)} does not exist")
 
 
-def _fingerprint(clip: Clip) -> str:
-    """What must be equal for interrupted work to be continued."""
-    head = {"version": store.VERSION, "clip": repr(clip), "keys": [str(key) for key in clip.keys]}
-    return _files.sha256_of(json.dumps(head).encode())
+def _check_clip(clip: Clip) -> None:
+    keys = clip.keys
+    name = store.check_name("clip name", clip.name)
+    if not keys:
+        raise ClipError(f"clip {name} has no frames; there is nothing to build")
+    if len(keys) > store.MAX_FRAMES:
+        raise ClipError(
+            f"clip {name} has {len(keys)} frames, a scene holds {store.MAX_FRAMES} at the most; "
+            "build it in parts"
+        )
+    if len(set(keys)) < len(keys):
+        raise ClipError(f"clip {name} has a frame twice; its keys must differ")
+    for camera in dict.fromkeys(key.camera for key in keys):
+        store.check_name("camera name", camera)
+    length = float(np.linalg.norm(np.asarray(clip.up_world, np.float64)))
+    if not abs(length - 1) < 1e-3:
+        raise ClipError(f"clip {name}: up_world must be a unit vector, its length is {length:g}")
 
 
 def _write_frames(
-    clip: Clip, work: Path, fingerprint: str, progress: bool
+    clip: Clip, work: Path, progress: bool
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Write all frames; entries for the manifest in the clip's order, and each file's digest."""
     from tqdm.auto import tqdm
 
-    done = _read_journal(work, fingerprint)
+    done = _finished(clip, work)
     start_s = None
     with _files.reported(work), (work / JOURNAL).open("a", encoding="utf-8") as journal:
-        if not done:
-            journal.write(json.dumps({"fingerprint": fingerprint}) + "\n")
         for key in tqdm(clip.keys, desc="build", unit="frame", disable=not progress):
             if str(key) not in done:
-                frame = clip.frame(key)
-                done[str(key)] = _write_frame(work, frame, clip.up_world)
-                journal.write(json.dumps({"key": str(key), **done[str(key)]}) + "\n")
+                record, parts = _stored(clip.frame(key), clip.up_world)
+                for relative, data in parts.items():
+                    _files.write_whole(work / relative, data)
+                done[str(key)] = record
+                journal.write(json.dumps({"key": str(key), **record}) + "\n")
                 journal.flush()
     entries: list[dict[str, Any]] = []
     files: dict[str, Any] = {}
@@ -159,7 +169,8 @@ def _write_frames(
     return entries, files
 
 
-def _write_frame(work: Path, frame: Frame, up_world: Float64) -> dict[str, Any]:
+def _stored(frame: Frame, up_world: Float64) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """What is written for a frame: its record in the journal, and bytes by relative path."""
     if frame.depth_m is None:
         raise ClipError(
             f"frame {frame.key} has no depth and no label to take a geometric prior from; give the "
@@ -168,37 +179,57 @@ def _write_frame(work: Path, frame: Frame, up_world: Float64) -> dict[str, Any]:
     axes = np.zeros((3, 3))
     axes[2] = up_world
     ambience = ambience_of(frame, axes)
-    files = {}
-    for part, data in store.encode_frame(frame).items():
-        relative = store.part_path(frame.key, part)
-        _files.write_whole(work / relative, data)
-        files[relative] = {"size": len(data), "sha256": _files.sha256_of(data)}
+    parts = {
+        store.part_path(frame.key, part): data for part, data in store.encode_frame(frame).items()
+    }
     entry = store.frame_record(frame, ambience) | {"airlight": ambience.airlight.tolist()}
-    return {"entry": entry, "files": files}
+    files = {
+        relative: {"size": len(data), "sha256": _files.sha256_of(data)}
+        for relative, data in parts.items()
+    }
+    return {"entry": entry, "files": files}, parts
 
 
-def _read_journal(work: Path, fingerprint: str) -> dict[str, dict[str, Any]]:
-    """Frames that interrupted work has finished, by key, each verified by its digests."""
+def _finished(clip: Clip, work: Path) -> dict[str, dict[str, Any]]:
+    """Frames by key that interrupted work on this clip has finished; else an empty work folder."""
+    head = {
+        "version": store.VERSION,
+        "name": clip.name,
+        "keys": _files.sha256_of(json.dumps([str(key) for key in clip.keys]).encode()),
+        "up_world": np.asarray(clip.up_world).tolist(),
+    }
+    done = _read_journal(work, head)
+    # The head cannot tell another size or source of depth; a frame made again can.
+    first = next((key for key in clip.keys if str(key) in done), None)
+    if first is not None:
+        record, _ = _stored(clip.frame(first), clip.up_world)
+        done = done if json.dumps(record) == json.dumps(done[str(first)]) else {}
+    with _files.reported(work):
+        if not done and work.exists():
+            shutil.rmtree(work)
+        (work / store.FRAMES).mkdir(parents=True, exist_ok=True)
+    lines = [head, *({"key": key, **record} for key, record in done.items())]
+    _files.write_whole(work / JOURNAL, "".join(json.dumps(x) + "\n" for x in lines).encode())
+    return done
+
+
+def _read_journal(work: Path, head: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Records of an interrupted job of this head, by key, whose files are whole."""
     path = work / JOURNAL
-    if not path.exists():
+    if not path.is_file():
         return {}
     records = _readable_prefix(path.read_text(encoding="utf-8", errors="replace").splitlines())
-    if not records or records[0].get("fingerprint") != fingerprint:
-        path.unlink()
+    if not records or records[0] != head:
         return {}
-    done = {}
-    for record in records[1:]:
-        whole = all(
-            (work / relative).is_file()
-            and _files.sha256_of_file(work / relative) == entry["sha256"]
-            for relative, entry in record["files"].items()
-        )
-        if whole:
-            done[record["key"]] = {"entry": record["entry"], "files": record["files"]}
-    body = [json.dumps({"fingerprint": fingerprint})]
-    body += [json.dumps({"key": key, **value}) for key, value in done.items()]
-    _files.write_whole(path, ("\n".join(body) + "\n").encode())
-    return done
+    return {
+        record["key"]: {"entry": record["entry"], "files": record["files"]}
+        for record in records[1:]
+        if all(_is_whole(work / path, file) for path, file in record["files"].items())
+    }
+
+
+def _is_whole(path: Path, file: dict[str, Any]) -> bool:
+    return path.is_file() and _files.sha256_of_file(path) == file["sha256"]
 
 
 def _readable_prefix(lines: list[str]) -> list[dict[str, Any]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from typing import Any
 
 from weather_aug._checks import finite
@@ -59,8 +60,8 @@ class WeatherPolicy:
                     f"weather type {printable(unknown[0])!r} is not one of {', '.join(TYPES)}"
                 )
             finite(f"weight of {name}", weight, 0)
-        if sum(self.types.values()) <= 0:
-            raise ArgumentError("the weights of types must sum to more than 0")
+        if not 0 < sum(self.types.values()) < math.inf:
+            raise ArgumentError("the weights of types must sum to a finite number above 0")
         try:
             low, high = (parse_severity(s) for s in self.severity)
         except (TypeError, ValueError) as error:
@@ -80,9 +81,8 @@ class WeatherPolicy:
         kind = self._kind(which)
         severity = self.severity[0] + (self.severity[1] - self.severity[0]) * float(how)
         falling = float(falls) < self.falling
-        weather = Weather.clear()
-        for part in kind.split("+"):
-            weather = Weather.mix(weather, weather_of(part, severity, falling=falling))
+        parts = [weather_of(part, severity, falling=falling) for part in kind.split("+")]
+        weather = reduce(Weather.mix, parts)
         speed = math.hypot(*weather.wind_m_per_s)
         angle = 2 * math.pi * float(direction)
         wind = (speed * math.cos(angle), speed * math.sin(angle), 0.0)
@@ -105,13 +105,15 @@ class WeatherPolicy:
     @classmethod
     def from_dict(cls, state: dict[str, Any]) -> WeatherPolicy:
         """The inverse of `to_dict`; unknown fields are refused."""
-        unknown = sorted(set(state) - set(_FIELDS))
+        if not isinstance(state, dict):
+            raise ArgumentError(
+                f"a WeatherPolicy is read from an object, got {type(state).__name__}"
+            )
+        unknown = sorted(set(state) - set(_FIELDS), key=str)
         if unknown:
             raise ArgumentError(
                 f"WeatherPolicy has no field {printable(unknown[0])}; it has {', '.join(_FIELDS)}"
             )
-        if "severity" in state:
-            state = state | {"severity": tuple(state["severity"])}
         return cls(**state)
 
 

@@ -7,8 +7,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from weather_aug.clip.types import Clip, Frame, FrameKey
 from weather_aug.errors import ArgumentError, IntegrityError, printable
 from weather_aug.particles.field import Window
@@ -85,7 +83,7 @@ class WeatherScene:
         """SHA-256 that names the scene's content."""
         return self.manifest.digest
 
-    @property
+    @cached_property
     def keys(self) -> tuple[FrameKey, ...]:
         """Keys of all frames, by time, then camera."""
         return tuple(record.key for record in self.manifest.frames)
@@ -100,13 +98,14 @@ class WeatherScene:
 
         Raises:
             ArgumentError: If the scene has no such frame.
+            SceneError: If a file of it cannot be read any more.
         """
         return store.read_frame(self.path, self._record(key))
 
     def ambience(self, key: FrameKey) -> Ambience:
         """Light around a frame; the airlight and the axes are the clip's."""
-        light = {name: np.asarray(value) for name, value in self._record(key).light.items()}
-        return Ambience(self.manifest.axes_world, **light, airlight=self.manifest.airlight)
+        manifest = self.manifest
+        return Ambience(manifest.axes_world, **self._record(key).light, airlight=manifest.airlight)
 
     def render(
         self,

@@ -10,9 +10,9 @@ Data only: nothing in it can run code, and every file has its size and SHA-256 i
 
 from __future__ import annotations
 
-import io
 import json
 import re
+import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,17 +23,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug import _files
-from weather_aug.clip.types import Camera, Frame, FrameKey
+from weather_aug.clip.types import RIGID_TOLERANCE, Camera, Frame, FrameKey
 from weather_aug.errors import DataError, IntegrityError, SceneError, printable
 from weather_aug.render.light import Ambience
+from weather_aug.taxonomy import CLASSES, IGNORE
 
 FORMAT = "weather_aug scene"
 VERSION = 1
 MANIFEST = "scene.json"
 FRAMES = "frames"
+MAX_FRAMES = 20_000
+MAX_MANIFEST_BYTES = 64 * 2**20
+"""More than MAX_FRAMES entries of the longest names take, so that what is built can be opened."""
+
+LARGEST = 1e10
+"""No coordinate (metres, pixels), speed or time (seconds) of a drive is greater."""
 
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 _PNG_LEVEL = 3
+_DEPTH, _LABEL = "<f2", "|u1"
+_PNG_START = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
+_MALFORMED = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
 
 
 @dataclass(frozen=True)
@@ -51,7 +61,7 @@ class FrameRecord:
     key: FrameKey
     time_s: float
     camera: Camera
-    light: Mapping[str, list[float]]
+    light: Mapping[str, NDArray[np.float64]]
     """Linear RGB medians of `sky`, `middle` and `ground`."""
     files: Mapping[str, str]
     """Relative path by part: `image`, `depth`, and `label` where there is one."""
@@ -76,9 +86,9 @@ class Manifest:
         object.__setattr__(self, "by_key", {record.key: record for record in self.frames})
 
 
-def check_name(what: str, name: str) -> str:
-    """Return a name that may stand in a file name, or refuse it."""
-    if not _SAFE_NAME.fullmatch(name):
+def check_name(what: str, name: Any) -> str:
+    """Return a name that may stand in a file name and on a terminal, or refuse it."""
+    if not isinstance(name, str) or not _SAFE_NAME.fullmatch(name):
         raise SceneError(f"{what} {printable(name)!r} must be letters, digits, '-' and '_'")
     return name
 
@@ -89,6 +99,8 @@ def encode_frame(frame: Frame) -> dict[str, bytes]:
     depth = np.asarray(frame.depth_m, np.float32)
     if np.isnan(depth).all():
         raise SceneError(f"frame {frame.key}: depth is NaN everywhere; repair the depth source")
+    _check_label(frame)
+    check_scale(frame.key, frame.camera, frame.time_s)
     with np.errstate(over="ignore"):
         stored = np.where(depth > 0, depth, np.inf).astype(np.float16)
     ok, png = cv2.imencode(
@@ -98,9 +110,9 @@ def encode_frame(frame: Frame) -> dict[str, bytes]:
     )
     if not ok:
         raise SceneError(f"frame {frame.key}: the picture cannot be encoded as PNG")
-    parts = {"image": png.tobytes(), "depth": _npy(stored)}
+    parts = {"image": png.tobytes(), "depth": _npy(stored, _DEPTH)}
     if frame.label is not None:
-        parts["label"] = _npy(np.ascontiguousarray(frame.label))
+        parts["label"] = _npy(frame.label, _LABEL)
     return parts
 
 
@@ -150,12 +162,12 @@ def read_manifest(folder: Path) -> Manifest:
             f"{printable(folder, 200)} is not a scene (no {MANIFEST}); make one with "
             "`weather-aug build CLIP --out SCENE`"
         )
-    content = _files.read_json(path)
+    content = _files.read_json(path, MAX_MANIFEST_BYTES)
     try:
         manifest = _parse(content, path)
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        if isinstance(error, SceneError):
-            raise
+    except SceneError:
+        raise
+    except _MALFORMED as error:
         raise SceneError(
             f"{printable(path, 200)} is malformed: {type(error).__name__} {printable(error)}; "
             "build the scene again"
@@ -175,44 +187,100 @@ def damaged_files(folder: Path, manifest: Manifest) -> list[str]:
     problems = []
     for relative, stored in manifest.files.items():
         file = folder / relative
-        if _files.sha256_of_file(file) != stored.sha256:
-            problems.append(f"{printable(file, 200)} has changed since the scene was built")
+        try:
+            changed = _files.sha256_of_file(file) != stored.sha256
+        except OSError as error:
+            problems.append(f"{printable(file, 200)} cannot be read: {error.strerror}")
+            continue
+        if changed:
+            problems.append(
+                f"{printable(file, 200)} has changed since the scene was built; build it again"
+            )
     return problems
 
 
 def read_frame(folder: Path, record: FrameRecord) -> Frame:
-    """One frame; depth and label are memory-mapped, the picture is decoded."""
-    key = record.key
-    image_path = folder / record.files["image"]
-    encoded = np.frombuffer(image_path.read_bytes(), np.uint8)
-    image = cv2.imdecode(encoded, cv2.IMREAD_COLOR_RGB)
-    if image is None:
-        raise SceneError(f"{printable(image_path, 200)} is not a readable PNG; build it again")
+    """One frame; depth and label are memory-mapped, the picture is decoded.
+
+    Raises:
+        SceneError: If a file of it cannot be read.
+    """
     label = record.files.get("label")
     return Frame(
-        key,
+        record.key,
         record.time_s,
         record.camera,
-        image,
-        None if label is None else _mapped(folder / label, np.uint8),
-        _mapped(folder / record.files["depth"], np.float16),
+        _picture(folder / record.files["image"], record.camera),
+        None if label is None else _mapped(folder / label, _LABEL, record.camera),
+        _mapped(folder / record.files["depth"], _DEPTH, record.camera),
     )
 
 
-def _npy(array: NDArray[Any]) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, array, allow_pickle=False)
-    return buffer.getvalue()
+def check_scale(key: FrameKey, camera: Camera, time_s: float) -> None:
+    """Refuse numbers that no drive has and that arithmetic in single precision cannot hold."""
+    lengths = (camera.intrinsics, camera.world_from_camera)
+    speeds = (camera.velocity_m_per_s, camera.angular_velocity_rad_per_s)
+    largest = max(float(np.abs(value).max()) for value in (*lengths, *speeds))
+    if not (largest <= LARGEST and abs(time_s) <= LARGEST and min(camera.focal_px) >= 1):
+        raise SceneError(
+            f"frame {key}: its calibration, pose, velocity or time ({time_s:g} s) holds a number "
+            f"beyond {LARGEST:g}, or a focal length below 1 pixel; repair the clip's files"
+        )
 
 
-def _mapped(path: Path, dtype: type) -> NDArray[Any]:
+def _check_label(frame: Frame) -> None:
+    if frame.label is None:
+        return
+    unknown = frame.label[(frame.label >= len(CLASSES)) & (frame.label != IGNORE)]
+    if unknown.size:
+        raise SceneError(
+            f"frame {frame.key}: label holds {int(unknown[0])}, which is no train id; choose the "
+            "clip's taxonomy with labels=…"
+        )
+
+
+def _npy(array: NDArray[Any], dtype: str) -> bytes:
+    return _npy_header(dtype, array.shape) + np.ascontiguousarray(array, dtype).tobytes()
+
+
+def _npy_header(dtype: str, shape: tuple[int, ...]) -> bytes:
+    """The only header that is written and read: numpy's parser runs a tokenizer over the text."""
+    text = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}, }}"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", 118) + text.ljust(117).encode() + b"\n"
+
+
+def _picture(path: Path, camera: Camera) -> NDArray[np.uint8]:
     try:
-        array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        data = path.read_bytes()
+    except OSError as error:
+        raise SceneError(f"{printable(path, 200)} cannot be read: {error.strerror}") from None
+    # Checked before decoding: a small file may claim gigabytes of pixels.
+    expected = _PNG_START + struct.pack(">II", camera.width, camera.height)
+    image = None
+    if data.startswith(expected):
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
+    if image is None:
+        raise SceneError(
+            f"{printable(path, 200)} is not a readable PNG of {camera.width}x{camera.height} "
+            "pixels; build the scene again"
+        )
+    return np.asarray(image, np.uint8)
+
+
+def _mapped(path: Path, dtype: str, camera: Camera) -> NDArray[Any]:
+    shape = (camera.height, camera.width)
+    header = _npy_header(dtype, shape)
+    try:
+        with path.open("rb") as file:
+            start = file.read(len(header))
+        array = np.memmap(path, dtype, "r", len(header), shape) if start == header else None
+    except (OSError, ValueError) as error:
         raise SceneError(f"{printable(path, 200)} cannot be read: {printable(error)}") from None
-    if array.dtype != dtype:
-        raise SceneError(f"{printable(path, 200)} holds {array.dtype}, not {np.dtype(dtype)}")
-    return array
+    if array is None:
+        raise SceneError(
+            f"{printable(path, 200)} is not a {dtype} array of shape {shape}; build the scene again"
+        )
+    return np.asarray(array)
 
 
 def _existing(folder: Path, relative: str) -> Path:
@@ -235,16 +303,18 @@ def _parse(content: Any, path: Path) -> Manifest:
         for relative, entry in content["files"].items()
     }
     frames = tuple(_parse_frame(entry) for entry in content["frames"])
+    if not frames or len({record.key for record in frames}) < len(frames):
+        raise SceneError(f"{printable(path, 200)} has no frames, or one twice; build it again")
     for record in frames:
         unlisted = sorted(set(record.files.values()) - set(files))
         if unlisted:
             raise SceneError(f"{printable(path, 200)}: {printable(unlisted[0])} has no digest")
     return Manifest(
-        name=str(content["name"]),
-        editor=str(content["editor"]),
-        weathers=tuple(str(w) for w in content["weathers"]),
-        axes_world=_array(content["axes_world"], (3, 3)),
-        airlight=_array(content["airlight"], (3,)),
+        name=check_name("name", content["name"]),
+        editor=check_name("editor", content["editor"]),
+        weathers=tuple(check_name("weather", name) for name in content["weathers"]),
+        axes_world=_axes(content["axes_world"]),
+        airlight=_light(content["airlight"]),
         frames=frames,
         files=files,
         digest=_files.sha256_of_file(path),
@@ -265,11 +335,25 @@ def _parse_frame(entry: Any) -> FrameRecord:
     files = {part: str(entry["files"][part]) for part in ("image", "depth")}
     if "label" in entry["files"]:
         files["label"] = str(entry["files"]["label"])
-    light = {name: entry["light"][name] for name in ("sky", "middle", "ground")}
-    for value in light.values():
-        _array(value, (3,))
-    key = FrameKey(int(entry["time_index"]), str(entry["camera"]))
-    return FrameRecord(key, float(entry["time_s"]), camera, light, files)
+    light = {name: _light(entry["light"][name]) for name in ("sky", "middle", "ground")}
+    key = FrameKey(int(entry["time_index"]), check_name("camera", entry["camera"]))
+    time_s = float(entry["time_s"])
+    check_scale(key, camera, time_s)
+    return FrameRecord(key, time_s, camera, light, files)
+
+
+def _axes(value: Any) -> NDArray[np.float64]:
+    axes = _array(value, (3, 3))
+    if np.abs(axes @ axes.T - np.eye(3)).max() > RIGID_TOLERANCE:
+        raise ValueError("axes_world are not perpendicular unit vectors")
+    return axes
+
+
+def _light(value: Any) -> NDArray[np.float64]:
+    light = _array(value, (3,))
+    if not ((light >= 0) & (light <= 1)).all():
+        raise ValueError("light must be in [0, 1]")
+    return light
 
 
 def _array(value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:

@@ -166,6 +166,8 @@ def _label(mask: Any, shape: tuple[int, int]) -> UInt8 | None:
     if mask is None:
         return None
     like_image("mask", mask, shape)
-    if mask.dtype.kind not in "iu" or mask.min() < 0 or mask.max() > 255:
-        raise ArgumentError(f"mask must hold train ids in 0..255, got {mask.dtype}")
+    if not np.can_cast(np.uint8, mask.dtype) or mask.dtype.kind not in "iu":
+        raise ArgumentError(f"mask must be an integer array that holds 0..255, got {mask.dtype}")
+    if mask.min() < 0 or mask.max() > 255:
+        raise ArgumentError(f"mask must hold train ids in 0..255, got up to {mask.max()}")
     return np.ascontiguousarray(mask, dtype=np.uint8)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import operator
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -55,8 +57,8 @@ class WeatherDataset(Dataset[Any]):
         options: RenderOptions = DEFAULT_OPTIONS,
     ) -> None:
         self.scenes = tuple(scenes)
-        if not self.scenes:
-            raise ArgumentError("scenes is empty; build one with `weather-aug build`")
+        if not self.scenes or not all(isinstance(scene, WeatherScene) for scene in self.scenes):
+            raise ArgumentError("scenes must be one or more of WeatherScene.load(folder)")
         self.policy = policy or WeatherPolicy()
         self.seed = check_seed("seed", seed)
         self.transform = transform
@@ -78,8 +80,15 @@ class WeatherDataset(Dataset[Any]):
         return int(self._epoch)
 
     def set_epoch(self, epoch: int) -> None:
-        """Draw the weather of another epoch, in this process and in all workers."""
-        self._epoch[0] = check_seed("epoch", epoch)
+        """Draw the weather of another epoch, in this process and in all workers.
+
+        Raises:
+            ArgumentError: If `epoch` is not an integer in [0, 2**63).
+        """
+        number = check_seed("epoch", epoch)
+        if not 0 <= number < 2**63:
+            raise ArgumentError(f"epoch must be in [0, 2**63), got {number}")
+        self._epoch[0] = number
 
     def __getitem__(self, index: int) -> Any:
         index = self._checked(index)
@@ -87,11 +96,11 @@ class WeatherDataset(Dataset[Any]):
         draw = self.policy.draw(self.seed, self.epoch, index)
         window = self._window(scene, key, index)
         shot = scene.render(key, draw.weather, seed=draw.seed, window=window, options=self.options)
-        sample = _sample(shot, _recipe(scene, key, draw, window))
+        sample = _sample(shot, _recipe(scene, key, draw, window, self.options))
         return _tensors(sample) if self.transform is None else self.transform(sample)
 
     def _checked(self, index: int) -> int:
-        number = index.__index__()
+        number = operator.index(index)
         if not -len(self) <= number < len(self):
             raise IndexError(f"index {number} is outside a dataset of {len(self)} frames")
         return number % len(self)
@@ -115,6 +124,8 @@ class WeatherDataset(Dataset[Any]):
     def _check_crop(self) -> None:
         if self.crop is None:
             return
+        if len(self.crop) != 2 or not all(isinstance(side, int) for side in self.crop):
+            raise ArgumentError(f"crop must be (height, width) in pixels, got {self.crop!r}")
         for scene in self.scenes:
             for key in scene.keys:
                 height, width = scene.size_of(key)
@@ -150,7 +161,13 @@ def _tensors(sample: Sample) -> Sample:
     return tensors
 
 
-def _recipe(scene: WeatherScene, key: Any, draw: WeatherDraw, window: Window | None) -> str:
+def _recipe(
+    scene: WeatherScene,
+    key: Any,
+    draw: WeatherDraw,
+    window: Window | None,
+    options: RenderOptions,
+) -> str:
     return json.dumps(
         {
             "scene": scene.name,
@@ -160,5 +177,6 @@ def _recipe(scene: WeatherScene, key: Any, draw: WeatherDraw, window: Window | N
             "weather": draw.weather.to_dict(),
             "seed": draw.seed,
             "window": window,
+            "options": asdict(options),
         }
     )

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from weather_aug import _files
+from weather_aug._checks import finite
 from weather_aug.clip.types import FrameKey
+from weather_aug.errors import ArgumentError
 from weather_aug.render.compose import RenderedFrame
 from weather_aug.scene.policy import weather_of
 from weather_aug.scene.scene import WeatherScene
@@ -111,7 +113,13 @@ def grid(
     """Rows of pictures on paper, each column with a heading, each row with its name.
 
     Pictures are scaled to one width; a row is as high as its first picture.
+
+    Raises:
+        ArgumentError: If there are no pictures, or `tile_width` is not in [1, 4096].
     """
+    if not rows or not all(rows):
+        raise ArgumentError("a sheet needs at least one weather and one picture in each row")
+    finite("tile_width", tile_width, 1, 4096)
     tiles = [[_scaled(image, tile_width) for image in row] for row in rows]
     columns = max(len(row) for row in tiles)
     left = _HEADER_PX
@@ -133,12 +141,12 @@ def grid(
 
 
 def write_png(path: Path, image: UInt8) -> None:
-    """Write a picture, whole or not at all; its folder is made.
+    """Write an (H, W, 3) picture or an (H, W) label, whole or not at all; its folder is made.
 
     Raises:
         OutputError: If it cannot be written.
     """
-    ok, png = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    ok, png = cv2.imencode(".png", image if image.ndim == 2 else image[..., ::-1])
     assert ok, "an 8-bit RGB array always encodes"
     with _files.reported(path):
         path.parent.mkdir(parents=True, exist_ok=True)

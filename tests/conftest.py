@@ -1,0 +1,29 @@
+"""What all rooms' tests share: the tiny street, and the scene built of it."""
+
+from __future__ import annotations
+
+import os
+
+# Read at the import of albumentations, which else asks the network for a newer version.
+os.environ.setdefault("NO_ALBUMENTATIONS_UPDATE", "1")
+
+import pytest
+from hypothesis import settings
+from tiny_clip import TinyClip
+
+from weather_aug.scene.scene import WeatherScene
+
+# Time limits for single examples fail on a busy machine, not on a fault.
+settings.register_profile("patient", deadline=None)
+settings.load_profile("patient")
+
+
+@pytest.fixture(scope="session")
+def tiny_clip() -> TinyClip:
+    return TinyClip()
+
+
+@pytest.fixture(scope="session")
+def tiny_scene(tiny_clip: TinyClip, tmp_path_factory: pytest.TempPathFactory) -> WeatherScene:
+    """Built once; tests that harm a scene copy its folder."""
+    return WeatherScene.build(tiny_clip, tmp_path_factory.mktemp("tiny") / "scene")

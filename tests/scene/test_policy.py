@@ -1,0 +1,189 @@
+"""WeatherPolicy: fair draws, each a function of (seed, epoch, item) alone."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from weather_aug.errors import ArgumentError
+from weather_aug.scene.policy import WeatherDraw, WeatherPolicy, weather_of
+from weather_aug.weather import Weather
+
+ITEMS = 20_000
+TYPES = {"clear": 1.0, "rain": 2.0, "snow": 2.0, "fog": 1.0, "rain+fog": 0.5}
+FALLS = {"rain": "rain_mm_per_h", "snow": "snow_mm_per_h"}
+LEAST_P = 1e-6
+
+seeds = st.integers(-(2**63), 2**64 - 1)
+types = st.dictionaries(
+    st.sampled_from([*TYPES, "snow+fog"]), st.floats(0.01, 100), min_size=1, max_size=6
+)
+
+
+@pytest.fixture(scope="module")
+def draws() -> list[WeatherDraw]:
+    policy = WeatherPolicy(TYPES, severity=(0.2, 0.9), falling=0.7)
+    return [policy.draw(11, 0, item) for item in range(ITEMS)]
+
+
+def test_types_come_by_their_weights(draws: list[WeatherDraw]) -> None:
+    counts = Counter(draw.kind for draw in draws)
+    weights = np.array(list(TYPES.values()))
+    observed = [counts[kind] for kind in TYPES]
+    assert sum(observed) == ITEMS
+    assert stats.chisquare(observed, ITEMS * weights / weights.sum()).pvalue >= LEAST_P
+
+
+@pytest.mark.parametrize("kind", TYPES)
+def test_severity_is_even_over_its_range_in_each_type(draws: list[WeatherDraw], kind: str) -> None:
+    severity = np.array([draw.severity for draw in draws if draw.kind == kind])
+    assert 0.2 <= severity.min() < severity.max() <= 0.9
+    assert stats.kstest(severity, "uniform", (0.2, 0.7)).pvalue >= LEAST_P
+
+
+@pytest.mark.parametrize("kind", FALLS)
+def test_the_share_that_falls_is_the_policys(draws: list[WeatherDraw], kind: str) -> None:
+    falls = [getattr(draw.weather, FALLS[kind]) > 0 for draw in draws if draw.kind == kind]
+    assert stats.binomtest(sum(falls), len(falls), 0.7).pvalue >= LEAST_P
+
+
+def test_wind_blows_from_any_side_with_the_weathers_strength(draws: list[WeatherDraw]) -> None:
+    winds = np.array([d.weather.wind_m_per_s for d in draws if d.kind == "snow"])
+    angles = np.arctan2(winds[:, 1], winds[:, 0])
+    assert stats.kstest(angles, "uniform", (-math.pi, 2 * math.pi)).pvalue >= LEAST_P
+    draw = next(d for d in draws if d.kind == "snow")
+    expected = math.hypot(*Weather.snow(draw.severity).wind_m_per_s)
+    assert math.hypot(*draw.weather.wind_m_per_s) == pytest.approx(expected)
+
+
+def test_particle_seeds_differ(draws: list[WeatherDraw]) -> None:
+    assert len({draw.seed for draw in draws}) == ITEMS
+
+
+@pytest.mark.parametrize("step", [(1, 0, 0), (0, 1, 0), (0, 0, 1)], ids=["seed", "epoch", "item"])
+def test_neighbours_do_not_know_of_each_other(step: tuple[int, int, int]) -> None:
+    policy = WeatherPolicy({"rain": 1.0}, severity=(0, 1))
+    seed, epoch, item = step
+    here = np.array([policy.draw(5, 5, i).severity for i in range(5_000)])
+    there = np.array([policy.draw(5 + seed, 5 + epoch, i + item).severity for i in range(5_000)])
+    assert abs(np.corrcoef(here, there)[0, 1]) <= 4 / math.sqrt(len(here))
+    assert not np.array_equal(here, there)
+
+
+@given(seeds, seeds, seeds)
+def test_a_draw_is_pure(seed: int, epoch: int, item: int) -> None:
+    policy = WeatherPolicy(TYPES)
+    before = random.getstate(), np.random.get_state()[1].tolist()  # noqa: NPY002
+    first = policy.draw(seed, epoch, item)
+    policy.draw(seed + 1 if seed < 0 else seed - 1 if seed else 1, epoch, item)
+    assert policy.draw(seed, epoch, item) == first
+    assert WeatherPolicy.from_dict(policy.to_dict()).draw(seed, epoch, item) == first
+    assert (random.getstate(), np.random.get_state()[1].tolist()) == before  # noqa: NPY002
+
+
+def test_a_plus_is_both_at_once() -> None:
+    draw = WeatherPolicy({"rain+fog": 1.0}, severity=(0.5, 0.5), falling=1).draw(0, 0, 0)
+    both = Weather.mix(Weather.rain(0.5), Weather.fog(0.5))
+    assert draw.kind == "rain+fog"
+    assert draw.weather.rain_mm_per_h == both.rain_mm_per_h > 0
+    assert draw.weather.visibility_m == both.visibility_m < math.inf
+
+
+@pytest.mark.parametrize("kind", ["rain", "snow", "fog"])
+def test_a_single_type_is_drawn_to_the_last_bit(kind: str) -> None:
+    """Nothing is mixed into it, so that a recipe shows the numbers that were asked for."""
+    draw = WeatherPolicy({kind: 1.0}, falling=1.0).draw(1, 2, 3)
+    expected = weather_of(kind, draw.severity).to_dict()
+    assert expected | {"wind_m_per_s": None} == draw.weather.to_dict() | {"wind_m_per_s": None}
+
+
+@pytest.mark.parametrize(("falling", "falls"), [(0.0, False), (1.0, True)])
+def test_falling_at_its_ends(falling: float, falls: bool) -> None:
+    policy = WeatherPolicy({"rain": 1.0}, falling=falling)
+    assert all((policy.draw(0, 0, i).weather.rain_mm_per_h > 0) is falls for i in range(50))
+
+
+def test_a_weight_of_zero_is_never_drawn() -> None:
+    policy = WeatherPolicy({"snow": 0.0, "rain": 1.0, "fog": 0.0})
+    assert {policy.draw(0, 0, item).kind for item in range(500)} == {"rain"}
+    assert policy._kind(1.0) == "rain"
+
+
+@given(types, st.tuples(st.floats(0, 1), st.floats(0, 1)), st.floats(0, 1))
+def test_a_dict_gives_an_equal_policy_back(
+    weights: dict[str, float], severity: tuple[float, float], falling: float
+) -> None:
+    policy = WeatherPolicy(weights, (min(severity), max(severity)), falling)
+    assert WeatherPolicy.from_dict(policy.to_dict()) == policy
+    assert WeatherPolicy.from_dict({}) == WeatherPolicy()
+
+
+def test_names_stand_for_severities() -> None:
+    assert WeatherPolicy(severity=("light", "heavy")).severity == (0.25, 0.75)  # type: ignore[arg-type]
+
+
+def test_a_callers_dict_is_copied() -> None:
+    weights = {"rain": 1.0}
+    policy = WeatherPolicy(weights)
+    weights["snow"] = 5.0
+    assert policy.types == {"rain": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"types": {}}, "at least one"),
+        ({"types": ["rain"]}, "at least one"),
+        ({"types": {"hail": 1}}, "'hail' is not one of clear, rain, snow, fog"),
+        ({"types": {"rain+hail": 1}}, "'hail'"),
+        ({"types": {"": 1}}, "''"),
+        ({"types": {3: 1}}, "'3'"),
+        ({"types": {"rain": -1}}, "weight of rain"),
+        ({"types": {"rain": math.nan}}, "weight of rain"),
+        ({"types": {"rain": math.inf}}, "weight of rain"),
+        ({"types": {"rain": "2"}}, "weight of rain"),
+        ({"types": {"rain": 0, "fog": 0}}, "above 0"),
+        ({"types": {"rain": 1e308, "fog": 1e308}}, "finite"),
+        ({"severity": (0.5, 0.2)}, "severity must be a range"),
+        ({"severity": (0.5, 1.2)}, "severity"),
+        ({"severity": (0.5, math.nan)}, "severity"),
+        ({"severity": 0.5}, "severity must be a range"),
+        ({"severity": "heavy"}, "severity must be a range"),
+        ({"severity": (0.1, 0.2, 0.3)}, "severity must be a range"),
+        ({"severity": None}, "severity must be a range"),
+        ({"falling": 1.1}, "falling"),
+        ({"falling": True}, "falling"),
+        ({"wetness": 1}, "no field wetness"),
+    ],
+    ids=str,
+)
+def test_a_bad_policy_is_refused(arguments: dict[str, Any], says: str) -> None:
+    with pytest.raises(ArgumentError, match=says.replace("'", ".")):
+        WeatherPolicy.from_dict(arguments)
+    if "wetness" not in arguments:
+        with pytest.raises(ArgumentError, match=says.replace("'", ".")):
+            WeatherPolicy(**arguments)
+
+
+@pytest.mark.parametrize("state", [None, [], "rain", 3])
+def test_a_policy_is_read_from_an_object(state: Any) -> None:
+    with pytest.raises(ArgumentError, match="object"):
+        WeatherPolicy.from_dict(state)
+
+
+def test_an_unknown_type_or_bad_key_is_refused() -> None:
+    with pytest.raises(ArgumentError, match="hail"):
+        weather_of("hail", 0.5)
+    with pytest.raises(ArgumentError, match="severity"):
+        weather_of("rain", 1.5)
+    for key in ((2**64, 0, 0), (0, 1.5, 0), (0, 0, True)):
+        with pytest.raises(ArgumentError, match="integer"):
+            WeatherPolicy().draw(*key)  # type: ignore[arg-type]

@@ -1,0 +1,1 @@
+"""Ratios against named peers, side by side in one process on one core."""

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from oracles.reference_render import srgb
 from render_scene import make_camera, make_frame
 
 from weather_aug.render.compose import render
-from weather_aug.render.label import readable_labels
+from weather_aug.render.label import least_linear_contrast, readable_labels
 from weather_aug.taxonomy import IGNORE, SKY
 from weather_aug.weather import Weather
 
@@ -13,15 +14,17 @@ AIRLIGHT = np.full(3, 0.5)
 
 
 def readable(label, transmittance, gap, covered=0):
+    """Labels of a 9 x 9 patch whose surface differs by `gap` (linear) from the airlight."""
     shape = (9, 9)
-    planes = [np.broadcast_to(np.asarray(v), shape).copy() for v in (label, transmittance, gap)]
-    return readable_labels(
-        planes[0].astype(np.uint8),
-        planes[1].astype(np.float32),
-        planes[2].astype(np.float32),
-        np.full(shape, covered, np.uint8),
-        AIRLIGHT,
-    )
+    gap, through = np.broadcast_to(gap, shape), np.full(shape, transmittance, np.float32)
+    distinct = (gap * through >= least_linear_contrast(AIRLIGHT)).astype(np.uint8)
+    label = np.full(shape, label, np.uint8)
+    return readable_labels(label, through, distinct, np.full(shape, covered, np.uint8))
+
+
+def test_least_contrast_is_two_and_a_half_levels_at_the_airlight():
+    step = least_linear_contrast(AIRLIGHT)
+    assert srgb(0.5 + step / 2) - srgb(0.5 - step / 2) == pytest.approx(2.5, rel=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from render_scene import make_camera, make_frame
 
 from weather_aug.errors import ArgumentError
-from weather_aug.render.compose import RenderOptions, checked_window, render
+from weather_aug.render.compose import RenderOptions, _clean_depth, checked_window, render
 from weather_aug.render.light import Ambience, airlight_from_sky, ambience_of
 from weather_aug.scene.policy import weather_of
 from weather_aug.taxonomy import SKY
@@ -70,7 +70,7 @@ def test_clear_weather_gives_the_picture_back():
 def test_weather_fades_in_from_the_clear_picture(kind):
     """The smallest severity changes next to nothing: no jump at 0."""
     frame = street_frame()
-    shot = render(frame, weather_of(kind, 0.005), seed=1, ambience=AMBIENCE)
+    shot = render(frame, weather_of(kind, 0.001), seed=1, ambience=AMBIENCE)
     near = np.isfinite(shot.depth)
     change = np.abs(shot.image.astype(int) - frame.image)[near]
     assert np.quantile(change, 0.99) <= (4 if kind == "fog" else 1)
@@ -175,3 +175,13 @@ def test_ambience_measures_sky_ground_and_the_rest():
     depth = np.where(label == SKY, np.inf, 10.0)
     unlabelled = ambience_of(make_frame(camera, image, depth), np.eye(3))
     np.testing.assert_allclose(light.sky, unlabelled.sky)
+
+
+def test_half_precision_depth_is_widened_exactly():
+    """Every float16 there is: positive finite ones up to the far limit keep their value."""
+    half = np.arange(2**16, dtype=np.uint16).view(np.float16)
+    wide = _clean_depth(half.reshape(256, 256)).reshape(-1)
+    expected = half.astype(np.float32)
+    far = ~((expected > 0) & (expected < 60000))
+    np.testing.assert_array_equal(np.where(far, np.inf, expected), wide)
+    np.testing.assert_array_equal(wide, _clean_depth(half.astype(np.float32)[None])[0])

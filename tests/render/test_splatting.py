@@ -51,9 +51,10 @@ def transmittance(particles, camera, depth_m=1000.0):
         order,
         band_starts,
         compose._falloff(),
-        np.empty((height, width, 3), np.uint8),
+        zero,
+        np.empty((3, height, width), np.uint8),
         through,
-        np.empty((height, width), np.float32),
+        np.empty((height, width), np.uint8),
         np.zeros((height, width), np.uint8),
     )
     return through

@@ -20,7 +20,7 @@ from weather_aug.particles import statistics
 from weather_aug.particles.field import MAX_PARTICLES, ParticleField, Window
 from weather_aug.particles.resolve import DEPTH_BINS, FAR_M, Resolved
 from weather_aug.render import kernels
-from weather_aug.render.label import NEIGHBOURHOOD_PX, readable_labels
+from weather_aug.render.label import NEIGHBOURHOOD_PX, least_linear_contrast, readable_labels
 from weather_aug.render.light import Ambience, rain_colour, snow_colour
 from weather_aug.taxonomy import SKY
 from weather_aug.weather import Weather
@@ -109,7 +109,7 @@ def render(
     fields = _fields(weather, seed, ambience)
     resolved = [field.resolve(frame.camera, options.max_particles) for field in fields]
     shot = _shade(frame, weather, ambience, outer, fields, resolved, image, depth, sky)
-    return _trimmed(shot, label, depth, outer, window, ambience.airlight)
+    return _trimmed(shot, label, depth, outer, window)
 
 
 def checked_window(window: Window | None, height: int, width: int) -> Window:
@@ -158,12 +158,23 @@ def _cut(frame: Frame, window: Window) -> tuple[UInt8, UInt8 | None, Float32]:
     top, left, height, width = window
     part = (slice(top, top + height), slice(left, left + width))
     assert frame.depth_m is not None
-    depth = np.asarray(frame.depth_m[part]).astype(np.float32)
-    depth[~((depth > 0) & (depth < kernels.FAR_DEPTH_M))] = np.inf
-    label = None if frame.label is None else np.asarray(frame.label[part])
+    depth = _clean_depth(np.asarray(frame.depth_m[part]))
+    label = None if frame.label is None else np.ascontiguousarray(frame.label[part])
     if label is not None:
-        depth[label == SKY] = np.inf
-    return np.asarray(frame.image[part]), label, depth
+        kernels.raise_sky(label.reshape(-1), np.uint8(SKY), depth.reshape(-1))
+    return np.ascontiguousarray(frame.image[part]), label, depth
+
+
+def _clean_depth(depth: NDArray[Any]) -> Float32:
+    """A float32 copy with far and unknown as `inf`."""
+    if depth.dtype == np.float16:
+        wide = np.empty(depth.shape, np.float32)
+        bits = np.ascontiguousarray(depth).view(np.uint16)
+        kernels.widen_depth(bits.reshape(-1), wide.view(np.int32).reshape(-1))
+        return wide
+    copy = np.array(depth, np.float32, order="C")
+    kernels.clean_depth(copy.reshape(-1))
+    return copy
 
 
 def _sky_by_depth(depth: Float32) -> NDArray[np.bool_]:
@@ -245,16 +256,16 @@ def _shade(
     bands = -(-height // kernels.BAND_ROWS)
     order, band_starts = kernels.order_by_band(splats, window, bands)
     curve, matrix = tone(weather.overcast)
-    planes = {
-        "image": np.empty((height, width, 3), np.uint8),
+    planes: dict[str, Any] = {
+        "image": np.empty((3, height, width), np.uint8),
         "transmittance": np.empty((height, width), np.float32),
-        "gap": np.empty((height, width), np.float32),
+        "distinct": np.empty((height, width), np.uint8),
         "covered": np.zeros((height, width), np.uint8),
     }
     kernels.compose(
-        np.ascontiguousarray(image),
+        image,
         depth,
-        np.ascontiguousarray(sky),
+        sky,
         window,
         optics,
         medium,
@@ -271,8 +282,10 @@ def _shade(
         order,
         band_starts,
         _falloff(),
+        np.float32(least_linear_contrast(ambience.airlight)),
         *planes.values(),
     )
+    planes["image"] = cv2.merge(tuple(planes["image"]))
     return planes
 
 
@@ -309,14 +322,13 @@ def _trimmed(
     depth: Float32,
     outer: Window,
     window: Window,
-    airlight: Float64,
 ) -> RenderedFrame:
     """Labels from the outer window, then everything cut to the inner one."""
     top, left = window[0] - outer[0], window[1] - outer[1]
     part = (slice(top, top + window[2]), slice(left, left + window[3]))
     seen = np.zeros(depth.shape, np.uint8) if label is None else label
     honest, invalid = readable_labels(
-        seen, shot["transmittance"], shot["gap"], shot["covered"], airlight
+        seen, shot["transmittance"], shot["distinct"], shot["covered"]
     )
     cut = np.ascontiguousarray
     return RenderedFrame(

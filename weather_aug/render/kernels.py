@@ -315,7 +315,7 @@ def _overcast_row(sky, ray_x, ray_y, optics, matrix, tone, airlight, red, green,
 
 @compiled
 def _fog_row(through, airlight, red, green, blue, gap):
-    """Veil one row, and say how far its surfaces are from the airlight."""
+    """Veil one row, and say how far (linear light) its surfaces are from the airlight."""
     a0, a1, a2 = airlight[0], airlight[1], airlight[2]
     for x in range(through.shape[0]):
         t = through[x]
@@ -349,20 +349,21 @@ def encode_row(light):
 
 
 @compiled
-def _blend_splat(splat, rows, window, depth, falloff, red, green, blue, through, covered):
-    """Blend one splat over rows [rows[0], rows[1]) of the window; the planes start at rows[0]."""
+def _blend_splat(splat, rows, window, falloff, planes, covered):
+    """Blend one splat over rows [rows[0], rows[1]) of the window; `planes` starts at rows[0]."""
     u, v = splat[0], splat[1]
     a, b, c, reach2, peak, z = splat[2], splat[3], splat[4], splat[5], splat[6], splat[7]
-    r, g, bl = splat[8], splat[9], splat[10]
+    red, green, blue = splat[8], splat[9], splat[10]
+    large = splat[11] > np.float32(0.0)
     top, left, _, width = window
     scale = np.float32(falloff.shape[0] / 12.5)
+    last_slot = np.int32(falloff.shape[0] - 1)
+    near_edge, one = np.float32(0.1), np.float32(1.0)
+    inverse_a = one / a
     det = a * c - b * b
     half_v = np.sqrt(reach2 * a / det)
     y0 = max(np.int64(np.ceil(v - half_v)) - top, rows[0])
     y1 = min(np.int64(np.floor(v + half_v)) - top, rows[1] - 1)
-    last_slot = np.int32(falloff.shape[0] - 1)
-    near_edge, one = np.float32(0.1), np.float32(1.0)
-    inverse_a = one / a
     for y in range(y0, y1 + 1):
         dy = np.float32(y + top) - v
         room = a * reach2 - det * dy * dy
@@ -372,9 +373,9 @@ def _blend_splat(splat, rows, window, depth, falloff, red, green, blue, through,
         half = np.sqrt(room) * inverse_a
         x0 = max(np.int64(np.ceil(middle - half)) - left, 0)
         x1 = min(np.int64(np.floor(middle + half)) - left, width - 1)
-        k = y - rows[0]
+        row = planes[y - rows[0]]
         for x in range(x0, x1 + 1):
-            ahead = depth[y, x] - z
+            ahead = row[4, x] - z
             if ahead <= -near_edge:
                 continue
             dx = np.float32(x + left) - u
@@ -382,11 +383,11 @@ def _blend_splat(splat, rows, window, depth, falloff, red, green, blue, through,
             alpha = peak * falloff[min(np.int32(power * scale), last_slot)]
             if ahead < near_edge:
                 alpha *= np.float32(0.5) + np.float32(5.0) * ahead
-            red[k, x] += alpha * (r - red[k, x])
-            green[k, x] += alpha * (g - green[k, x])
-            blue[k, x] += alpha * (bl - blue[k, x])
-            through[y, x] *= one - alpha
-            if splat[11] > np.float32(0.0) and alpha > np.float32(0.5):
+            row[0, x] += alpha * (red - row[0, x])
+            row[1, x] += alpha * (green - row[1, x])
+            row[2, x] += alpha * (blue - row[2, x])
+            row[3, x] *= one - alpha
+            if large and alpha > np.float32(0.5):
                 covered[y, x] = 1
 
 
@@ -407,9 +408,10 @@ def compose(
     order,
     band_starts,
     falloff,
+    least_contrast,
     out,
     through,
-    gap,
+    distinct,
     covered,
 ):
     """Render the window: tone, fog and particles in linear light, band by band.
@@ -430,18 +432,22 @@ def compose(
         order: Splat indices by band.
         band_starts: (bands + 1,).
         falloff: exp(-x / 2) for x in [0, 12.5), float32.
-        out: (H, W, 3) uint8 out.
+        least_contrast: Linear difference from the airlight that can just be seen.
+        out: (3, H, W) uint8 out.
         through: (H, W) float32 out: transmittance of air and particles.
-        gap: (H, W) float32 out: largest linear difference of the surface from the airlight.
+        distinct: (H, W) uint8 out: 1 where what is left of the surface's difference from the
+            airlight can be seen.
         covered: (H, W) uint8, zero: set where a large particle hides the surface.
     """
     top, left, height, width = window
     ray_x = np.empty(width, np.float32)
     for x in range(width):
         ray_x[x] = (np.float32(x + left) - optics.cx) / optics.fx
-    red = np.empty((BAND_ROWS, width), np.float32)
-    green = np.empty((BAND_ROWS, width), np.float32)
-    blue = np.empty((BAND_ROWS, width), np.float32)
+    # Red, green, blue, transmittance and depth of a band's rows side by side. The odd stride keeps
+    # them apart in the cache: planes of equal page offset would evict each other at every pixel.
+    stride = (width + 15) // 16 * 16 + 80
+    planes = np.empty((BAND_ROWS, 5, stride), np.float32)
+    gap = np.empty((BAND_ROWS, width), np.float32)
     tau = np.empty(width, np.float32)
     slant = np.empty(width, np.float32)
     overcast = tone.overcast > np.float32(0.0)
@@ -451,43 +457,100 @@ def compose(
         for y in range(y0, y1):
             k = y - y0
             ray_y = (np.float32(y + top) - optics.cy) / optics.fy
+            red, green, blue = planes[k, 0, :width], planes[k, 1, :width], planes[k, 2, :width]
+            clear = planes[k, 3, :width]
+            planes[k, 4, :width] = depth[y]
             _transmittance_row(
-                depth[y], ray_x, ray_y, optics, medium, resolved_depth, tau, slant, through[y]
+                depth[y], ray_x, ray_y, optics, medium, resolved_depth, tau, slant, clear
             )
-            _decode_row(image[y], linear, red[k], green[k], blue[k])
+            _decode_row(image[y], linear, red, green, blue)
             if overcast:
                 _overcast_row(
-                    sky[y],
-                    ray_x,
-                    ray_y,
-                    optics,
-                    matrix,
-                    tone,
-                    airlight,
-                    red[k],
-                    green[k],
-                    blue[k],
+                    sky[y], ray_x, ray_y, optics, matrix, tone, airlight, red, green, blue
                 )
-            _fog_row(through[y], airlight, red[k], green[k], blue[k], gap[y])
+            _fog_row(clear, airlight, red, green, blue, gap[k])
         for k in range(band_starts[band], band_starts[band + 1]):
-            _blend_splat(
-                splats[order[k]],
-                (y0, y1),
-                window,
-                depth,
-                falloff,
-                red,
-                green,
-                blue,
-                through,
-                covered,
-            )
+            _blend_splat(splats[order[k]], (y0, y1), window, falloff, planes, covered)
         for y in range(y0, y1):
             k = y - y0
-            encode_row(red[k])
-            encode_row(green[k])
-            encode_row(blue[k])
-            for x in range(width):
-                out[y, x, 0] = np.uint8(np.int32(red[k, x]))
-                out[y, x, 1] = np.uint8(np.int32(green[k, x]))
-                out[y, x, 2] = np.uint8(np.int32(blue[k, x]))
+            for channel in range(3):
+                encode_row(planes[k, channel, :width])
+                _quantise_row(planes[k, channel, :width], out[channel, y])
+            through[y] = planes[k, 3, :width]
+            _distinct_row(gap[k], through[y], least_contrast, distinct[y])
+
+
+@compiled
+def _quantise_row(levels, out):
+    for x in range(levels.shape[0]):
+        out[x] = np.uint8(np.int32(levels[x]))
+
+
+@compiled
+def _distinct_row(gap, through, least_contrast, out):
+    for x in range(gap.shape[0]):
+        out[x] = np.uint8(1) if gap[x] * through[x] >= least_contrast else np.uint8(0)
+
+
+@compiled
+def widen_depth(half, out):
+    """Turn float16 bits into float32 depth, far and unknown as `inf`; numpy does it slower.
+
+    Args:
+        half: (N,) uint16 bits of float16 values.
+        out: (N,) int32 view of the float32 output.
+    """
+    values = out.view(np.float32)
+    for i in range(half.shape[0]):
+        bits = np.int32(half[i])
+        # Exponent and mantissa at their float32 places; the exponent's bias is repaired below.
+        out[i] = (bits & np.int32(0x7FFF)) << np.int32(13)
+        # Negative numbers lose their sign here, so they become 0, which means unknown.
+        out[i] = out[i] if bits < np.int32(0x8000) else np.int32(0)
+    for i in range(values.shape[0]):
+        z = values[i] * np.float32(2.0**112)
+        values[i] = (
+            z if (z > np.float32(0.0)) & (z < np.float32(FAR_DEPTH_M)) else np.float32(np.inf)
+        )
+
+
+@compiled
+def clean_depth(depth):
+    """Set far and unknown depth (NaN, 0, negative) to `inf`, in place; (N,) float32."""
+    for i in range(depth.shape[0]):
+        z = depth[i]
+        depth[i] = (
+            z if (z > np.float32(0.0)) & (z < np.float32(FAR_DEPTH_M)) else np.float32(np.inf)
+        )
+
+
+@compiled
+def raise_sky(label, sky_id, depth):
+    """Set the depth of what is labelled sky to `inf`, in place."""
+    for i in range(depth.shape[0]):
+        depth[i] = depth[i] if label[i] != sky_id else np.float32(np.inf)
+
+
+@compiled
+def read_labels(label, through, near_distinct, covered, limits, ignore, sky_id, out, invalid):
+    """Labels and invalid mask by the rules of `weather_aug.render.label`; all arrays are (N,).
+
+    Args:
+        label: uint8 train ids.
+        through: float32 transmittance.
+        near_distinct: uint8, 1 where something distinct is near.
+        covered: uint8.
+        limits: Transmittances below which a surface is hazy, doubtful, hidden.
+        ignore: Id of what cannot be seen.
+        sky_id: Id of the sky.
+        out: uint8 out.
+        invalid: uint8 out.
+    """
+    hazy, doubtful, hidden = limits
+    for i in range(label.shape[0]):
+        t = through[i]
+        surface = label[i] != sky_id
+        unseen = surface & ((t < hidden) | ((t < hazy) & (near_distinct[i] == 0)))
+        unseen = unseen | (covered[i] != 0)
+        out[i] = ignore if unseen else label[i]
+        invalid[i] = np.uint8(1) if unseen | (surface & (t < doubtful)) else np.uint8(0)

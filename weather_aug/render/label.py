@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug.colour import LUMINANCE
+from weather_aug.render import kernels
 from weather_aug.taxonomy import IGNORE, SKY
 
 Float32 = NDArray[np.float32]
@@ -24,46 +25,47 @@ HAZY_TRANSMITTANCE = 0.5
 
 
 def readable_labels(
-    label: UInt8,
-    transmittance: Float32,
-    gap: Float32,
-    covered: UInt8,
-    airlight: NDArray[np.floating],
+    label: UInt8, transmittance: Float32, distinct: UInt8, covered: UInt8
 ) -> tuple[UInt8, UInt8]:
     """Labels for training and the mask of unreadable pixels.
 
     Args:
         label: (H, W) train ids of the clear frame.
         transmittance: (H, W) share of the surface's light that reaches the pixel.
-        gap: (H, W) largest linear difference of a surface from the airlight.
+        distinct: (H, W), 1 where what is left of a surface's light differs visibly from the
+            airlight (by `least_linear_contrast`).
         covered: (H, W), 1 where a large particle hides the surface.
-        airlight: (3,) linear RGB.
 
     Returns:
         (H, W) train ids with 255 where the surface cannot be detected, and (H, W) uint8 with 1
         where it is undetectable or beyond the optical range (as ACDC's invalid mask). The sky stays
         the sky: it is what the airlight looks like.
     """
-    out = label.copy()
-    invalid = covered.copy()
-    out[covered > 0] = IGNORE
-    if transmittance.size == 0 or transmittance.min() >= HAZY_TRANSMITTANCE:
-        return out, invalid
-    surface = label != SKY
-    distinct = surface & (transmittance * gap >= _least_linear_contrast(airlight))
-    near_distinct = cv2.dilate(
-        distinct.view(np.uint8), np.ones((NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX), np.uint8)
+    near_distinct = distinct
+    if transmittance.min() < HAZY_TRANSMITTANCE:
+        surfaces = distinct & (label != SKY)
+        size = (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX)
+        near_distinct = cv2.dilate(surfaces, np.ones(size, np.uint8))
+    out, invalid = np.empty_like(label), np.empty_like(label)
+    limits = (HAZY_TRANSMITTANCE, DOUBTFUL_TRANSMITTANCE, LEAST_TRANSMITTANCE)
+    planes = (label, transmittance, near_distinct, covered)
+    kernels.read_labels(
+        *(plane.reshape(-1) for plane in planes),
+        tuple(np.float32(limit) for limit in limits),
+        np.uint8(IGNORE),
+        np.uint8(SKY),
+        out.reshape(-1),
+        invalid.reshape(-1),
     )
-    hidden = (transmittance < HAZY_TRANSMITTANCE) & (near_distinct == 0)
-    hidden |= transmittance < LEAST_TRANSMITTANCE
-    hidden &= surface
-    out[hidden] = IGNORE
-    invalid[hidden | (surface & (transmittance < DOUBTFUL_TRANSMITTANCE))] = 1
     return out, invalid
 
 
-def _least_linear_contrast(airlight: NDArray[np.floating]) -> float:
-    """The sRGB threshold as linear light, by the slope of the encoding at the airlight."""
+def least_linear_contrast(airlight: NDArray[np.floating]) -> float:
+    """The least visible difference in linear light, by the slope of the encoding at the airlight.
+
+    Args:
+        airlight: (3,) linear RGB.
+    """
     luminance = max(float(airlight @ LUMINANCE), 0.0031308)
     slope = 1.055 / 2.4 * luminance ** (1 / 2.4 - 1)
     return LEAST_CONTRAST_LEVELS / 255 / slope

@@ -14,7 +14,7 @@ from weather_aug._checks import finite
 from weather_aug._keys import check_seed
 from weather_aug.clip.types import Camera, Frame, FrameKey
 from weather_aug.colour import LUMINANCE
-from weather_aug.edit.physical.overcast import tone
+from weather_aug.edit.physical.overcast import ZENITH_GAIN, tone
 from weather_aug.errors import ArgumentError
 from weather_aug.particles import statistics
 from weather_aug.particles.field import MAX_PARTICLES, ParticleField, Window
@@ -29,9 +29,6 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 
-ZENITH_GAIN = 0.6
-"""How much brighter an overcast sky is overhead than at the horizon, less than the CIE's 2, because
-the camera exposes for the street and clips."""
 FALLOFF_STEPS = 2048
 
 

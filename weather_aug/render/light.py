@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from weather_aug.clip.types import Frame
 from weather_aug.colour import LUMINANCE, SRGB_LEVELS_LINEAR, linear_from_srgb
-from weather_aug.edit.physical.overcast import tone
+from weather_aug.edit.physical.overcast import MEAN_SKY_GAIN, tone
 from weather_aug.render.kernels import FAR_DEPTH_M
 from weather_aug.taxonomy import GROUND, SKY
 
@@ -39,13 +39,14 @@ class Ambience:
     airlight: Float64
 
     def under(self, overcast: float) -> Ambience:
-        """The same light after the weather's tone and sky."""
+        """The same light after the weather's tone, under the whole of the weather's sky."""
         curve, matrix = tone(overcast)
         toned = {
             name: matrix @ np.interp(getattr(self, name), SRGB_LEVELS_LINEAR, curve)
             for name in ("sky", "middle", "ground")
         }
-        toned["sky"] = toned["sky"] + overcast * (self.airlight - toned["sky"])
+        closed = MEAN_SKY_GAIN * self.airlight
+        toned["sky"] = toned["sky"] + overcast * (closed - toned["sky"])
         return replace(self, **toned)
 
 

@@ -10,6 +10,11 @@ from weather_aug.colour import LUMINANCE, SRGB_LEVELS_LINEAR
 Float64 = NDArray[np.float64]
 
 MIDDLE_GREY = 0.18
+ZENITH_GAIN = 0.6
+"""An overcast sky is 1 + this times as bright overhead as at the horizon, where it has the
+airlight's colour; less than the CIE's 3, because the camera exposes for the street and clips."""
+MEAN_SKY_GAIN = 1.0 + 0.5 * ZENITH_GAIN
+"""Its mean over the hemisphere: the mean sine of elevation is one half."""
 
 
 def tone(overcast: float) -> tuple[Float64, Float64]:

@@ -62,8 +62,7 @@ PALETTE = (
 
 TRAIN_ID = {name: index for index, name in enumerate(CLASSES)}
 ROAD, SIDEWALK, BUILDING, VEGETATION, TERRAIN, SKY = (
-    TRAIN_ID[name]
-    for name in ("road", "sidewalk", "building", "vegetation", "terrain", "sky")
+    TRAIN_ID[name] for name in ("road", "sidewalk", "building", "vegetation", "terrain", "sky")
 )
 GROUND = (ROAD, SIDEWALK, TERRAIN)
 

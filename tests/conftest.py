@@ -27,3 +27,10 @@ def tiny_clip() -> TinyClip:
 def tiny_scene(tiny_clip: TinyClip, tmp_path_factory: pytest.TempPathFactory) -> WeatherScene:
     """Built once; tests that harm a scene copy its folder."""
     return WeatherScene.build(tiny_clip, tmp_path_factory.mktemp("tiny") / "scene")
+
+
+@pytest.fixture(scope="session")
+def unlabelled_scene(tmp_path_factory: pytest.TempPathFactory) -> WeatherScene:
+    """The same street where nobody labelled it."""
+    folder = tmp_path_factory.mktemp("unlabelled") / "scene"
+    return WeatherScene.build(TinyClip(name="unlabelled", labelled=False), folder)

@@ -13,7 +13,7 @@ import tyro
 from tyro.conf import Positional
 
 from weather_aug import _files
-from weather_aug.errors import ArgumentError, IntegrityError, WeatherAugError, printable
+from weather_aug.errors import ArgumentError, DataError, IntegrityError, WeatherAugError, printable
 
 
 @dataclass(frozen=True)
@@ -181,12 +181,7 @@ class Inspect:
 
     def run(self) -> None:
         """Print the contents, then verify; damage ends with exit code 4."""
-        from weather_aug.scene import store
-
-        if (self.path / store.MANIFEST).is_file():
-            problems = _inspect_scene(self.path)
-        else:
-            problems = _inspect_export(self.path)
+        problems = _inspected(self.path)
         for problem in problems[1:]:
             _say(problem)
         if problems:
@@ -263,6 +258,21 @@ def main(arguments: list[str] | None = None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+def _inspected(path: Path) -> list[str]:
+    from weather_aug.scene import store
+    from weather_aug.writers import layout
+    from weather_aug.writers.verify import verify_export
+
+    if (path / store.MANIFEST).is_file():
+        return _inspect_scene(path)
+    if any((path / name).exists() for name in (layout.CONTENTS, layout.JOURNAL)):
+        return verify_export(path)
+    raise DataError(
+        f"{printable(path, 200)} is neither a scene (no {store.MANIFEST}) nor an export (no "
+        f"{layout.CONTENTS})"
+    )
+
+
 def _inspect_scene(path: Path) -> list[str]:
     from weather_aug.scene.scene import WeatherScene
 
@@ -274,12 +284,6 @@ def _inspect_scene(path: Path) -> list[str]:
     _say(f"{len(scene.keys)} frames ({labelled} labelled) of {', '.join(scene.cameras)}")
     _say(f"{len(manifest.files)} files, {size_mib:.1f} MiB")
     return scene.damaged_files()
-
-
-def _inspect_export(path: Path) -> list[str]:
-    from weather_aug.writers.verify import verify_export
-
-    return verify_export(path)
 
 
 def _severity(text: str) -> float | str:

@@ -48,7 +48,8 @@ class RandomWeather(A.DualTransform):
         p: Probability of any weather.
 
     Raises:
-        ArgumentError: If an image has no depth and no mask to take a prior from.
+        ArgumentError: If an argument is out of range, or at a call an image has no depth and no
+            mask to take a prior from.
     """
 
     class InitSchema(BaseTransformInitSchema):
@@ -72,9 +73,11 @@ class RandomWeather(A.DualTransform):
             policy = policy.to_dict()
         self.policy = WeatherPolicy.from_dict(policy or {}).to_dict()
         low, high = (finite("speed_m_per_s", v, 0, 100) for v in speed_m_per_s)
+        if low > high:
+            raise ArgumentError(f"speed_m_per_s must be a range (low, high), got {speed_m_per_s}")
         self.speed_m_per_s = (low, high)
         self.camera_height_m = finite("camera_height_m", camera_height_m, 0.1, 100)
-        self.max_particles = max_particles
+        self.max_particles = RenderOptions(max_particles).max_particles
 
     def get_params(self) -> dict[str, Any]:
         """Draw weather, seed and speed: JSON values only, so that a replay can store them."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,18 @@ def run_out_of_memory(plan: Any, out: Path, pipe: Any) -> None:
         return write_sample(plan, out, index)
 
     worker.write_sample = large
+    worker.work(plan, out, pipe)
+
+
+def sleep_on_one_item(plan: Any, out: Path, pipe: Any) -> None:
+    """Be busy with DEADLY_ITEM for longer than any test."""
+
+    def slow(plan: Any, out: Path, index: int) -> str:
+        if index == DEADLY_ITEM:
+            time.sleep(60)
+        return write_sample(plan, out, index)
+
+    worker.write_sample = slow
     worker.work(plan, out, pipe)
 
 

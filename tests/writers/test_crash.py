@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import POLICY, tree_of
+from tiny_export import POLICY, tree_of
 
 from weather_aug import _files
 from weather_aug.errors import OutputError
@@ -30,16 +30,18 @@ FAULTY = [(os, "fsync"), (os, "open"), (Path, "open"), (Path, "replace"), (Path,
 FAULTY += [(Path, "unlink")]
 
 SCRIPT = """
-import sys
+import json, sys
 from pathlib import Path
+import export_faults
 from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.scene.scene import WeatherScene
+from weather_aug.writers import engines
 from weather_aug.writers.export import export
 from weather_aug.writers.plan import plan_export
 
 if __name__ == "__main__":
-    scene, out, policy, count, workers = sys.argv[1:]
-    import json
+    scene, out, policy, count, workers, fault = sys.argv[1:]
+    engines.work = getattr(export_faults, fault, engines.work)
     plan = plan_export(
         [WeatherScene.load(scene)],
         WeatherPolicy.from_dict(json.loads(policy)),
@@ -192,15 +194,18 @@ def test_a_write_cut_short_by_the_system_can_be_continued(
     assert tree_of(out) == small_tree
 
 
-def started(plan: ExportPlan, out: Path, workers: int) -> subprocess.Popen[bytes]:
-    """An exporter in a session of its own."""
+def started(
+    plan: ExportPlan, out: Path, workers: int, fault: str = "none"
+) -> subprocess.Popen[bytes]:
+    """An exporter in a session of its own, its workers with a fault of `export_faults`."""
     script = out.parent / "script.py"
     script.write_text(SCRIPT)
     policy = json.dumps(plan.policy.to_dict())
-    arguments = [plan.scenes[0].path, out, policy, plan.count, workers]
+    arguments = [plan.scenes[0].path, out, policy, plan.count, workers, fault]
     return subprocess.Popen(
         [sys.executable, str(script), *map(str, arguments)],
         start_new_session=True,
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parent)},
         stderr=subprocess.PIPE,
     )
 
@@ -230,15 +235,24 @@ def live_members(session: int) -> list[int]:
 
 def assert_all_leave(session: int, since_s: float) -> None:
     """Within 2 s, workers and the helper that multiprocessing starts."""
-    while live_members(session):
-        assert time.monotonic() - since_s < 2, "workers outlive their parent"
+    while left := live_members(session):
+        if time.monotonic() - since_s > 2:
+            os.killpg(session, signal.SIGKILL)
+            pytest.fail(f"workers {left} outlive their parent")
         time.sleep(0.01)
 
 
 def kill_and_continue(
-    plan: ExportPlan, out: Path, lines: int, *, workers: int, then: int, whole_group: bool
+    plan: ExportPlan,
+    out: Path,
+    lines: int,
+    *,
+    workers: int,
+    then: int,
+    whole_group: bool,
+    fault: str = "none",
 ) -> None:
-    process = started(plan, out, workers)
+    process = started(plan, out, workers, fault)
     wait_for_lines(process, out, lines)
     if whole_group:
         os.killpg(process.pid, signal.SIGKILL)
@@ -246,7 +260,9 @@ def kill_and_continue(
         assert len(live_members(process.pid)) > workers > 1
         process.kill()
     killed_s = time.monotonic()
-    process.communicate()
+    # Not communicate(): a worker that stayed would hold the pipe of errors open.
+    process.wait(5)
+    process.stderr.close()
     assert_committed_verifies(out)
     if not whole_group:
         assert_all_leave(process.pid, killed_s)
@@ -263,6 +279,15 @@ def test_killed_alone_it_takes_its_workers_along(
 ) -> None:
     out = tmp_path / "out"
     kill_and_continue(long, out, 3, workers=2, then=1, whole_group=False)
+    assert tree_of(out) == long_tree
+
+
+def test_killed_alone_it_takes_busy_workers_along(
+    long: ExportPlan, long_tree: dict[str, str], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    how = {"workers": 2, "then": 1, "whole_group": False, "fault": "sleep_on_one_item"}
+    kill_and_continue(long, out, 6, **how)
     assert tree_of(out) == long_tree
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import export_faults
 import pytest
-from conftest import tree_of
+from tiny_export import tree_of
 
 from weather_aug.errors import IntegrityError, OutputError, WeatherAugError
 from weather_aug.writers import engines

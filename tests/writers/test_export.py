@@ -12,10 +12,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from conftest import POLICY, TinyClip, tree_of
+from tiny_export import POLICY, TinyClip, tree_of
 
 from weather_aug import _files
-from weather_aug.errors import ConflictError, IntegrityError, OutputError, SceneError
+from weather_aug.errors import ArgumentError, ConflictError, IntegrityError, OutputError, SceneError
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.writers import engines, lock
 from weather_aug.writers.export import export
@@ -310,6 +310,15 @@ def test_unusable_outputs_are_refused_before_the_first_render(
             export(plan, out)
     assert sorted(path.name for path in full.iterdir()) == ["mine"]
     assert WeatherScene.load(scene.path, verify=True).damaged_files() == []
+
+
+@pytest.mark.parametrize("workers", [-1, 1025, 1.5, True])
+def test_a_number_of_workers_that_makes_no_sense_is_refused(
+    plan: ExportPlan, out: Path, workers: Any
+) -> None:
+    with pytest.raises(ArgumentError, match="workers must be"):
+        export(plan, out, workers=workers)
+    assert not out.exists()
 
 
 def test_an_unreadable_scene_is_named(tmp_path: Path) -> None:

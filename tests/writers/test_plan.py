@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from conftest import POLICY, TinyClip
 from hypothesis import given
 from hypothesis import strategies as st
+from tiny_export import POLICY, TinyClip
 
 from weather_aug.errors import ArgumentError, ConflictError, SceneError
 from weather_aug.render.compose import RenderOptions

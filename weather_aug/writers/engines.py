@@ -29,6 +29,7 @@ MAX_RETRIES = 2
 MAX_QUARANTINED = 8
 """Items lost after which it is the machine that is at fault, and the run ends."""
 MAX_FAILED_STARTS = 3
+LISTEN_S = 2.0
 STOP_WAIT_S = 5.0
 
 Finished = tuple[int, str]
@@ -101,8 +102,13 @@ class _Crew:
 
     def finished(self) -> Iterator[Finished]:
         """Wait until a worker says something or dies; give the items that were finished."""
-        heard = connection.wait([member.pipe for member in self.members])
-        for member in [m for m in self.members if m.pipe in heard]:
+        heard = connection.wait([member.pipe for member in self.members], LISTEN_S)
+        for member in self.members.copy():
+            if member.pipe not in heard:
+                # A process forked by another thread may hold a dead worker's pipe open.
+                if not member.process.is_alive() and not member.pipe.poll():
+                    self._bury(member)
+                continue
             try:
                 kind, value = member.pipe.recv()
             except (EOFError, OSError):

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from weather_aug import _files
-from weather_aug._checks import finite
-from weather_aug.errors import ConflictError, DataError, IntegrityError, printable
+from weather_aug._keys import check_seed
+from weather_aug.errors import ArgumentError, ConflictError, DataError, IntegrityError, printable
 from weather_aug.writers import layout
 from weather_aug.writers.engines import Finished, run_inline, run_processes
 from weather_aug.writers.journal import Journal, job_of, write_journal
@@ -72,6 +72,7 @@ def export(
             completion.
 
     Raises:
+        ArgumentError: If `workers` is not an integer in its range.
         ConflictError: If another process exports to `out`, it holds another job or other files, or
             a scene was rebuilt since it was planned.
         OutputError: If `out` lies inside a scene, is a file, or cannot be written.
@@ -79,7 +80,8 @@ def export(
         IntegrityError: If items are missing because they killed their workers.
     """
     start_s = time.monotonic()
-    finite("workers", workers, 0, MAX_WORKERS)
+    if not 0 <= check_seed("workers", workers) <= MAX_WORKERS:
+        raise ArgumentError(f"workers must be in [0, {MAX_WORKERS}], got {workers}")
     out = check_output(Path(out), [scene.path for scene in plan.scenes])
     plan.check_scenes()
     rendered = damaged = 0
@@ -90,7 +92,7 @@ def export(
             with Journal(out / layout.JOURNAL, plan, out, progress=progress) as journal:
                 damaged = journal.damaged
                 _make_folders(plan, out)
-                rendered = _render(plan, out, journal, int(workers), progress, on_sample)
+                rendered = _render(plan, out, journal, workers, progress, on_sample)
                 contents = finish(plan, out, journal)
         with _files.reported(out):
             for name in (layout.QUARANTINE, layout.JOURNAL):

@@ -15,11 +15,12 @@ import numpy as np
 
 from weather_aug._checks import MAX_PIXELS
 from weather_aug._keys import check_seed
+from weather_aug.clip.street_draw import Canvas, Rig, fill
 from weather_aug.clip.street_layout import CHUNK_M, SECTION, Actor, chunk
-from weather_aug.clip.street_light import Canvas, Rig, Setting, Surfaces, fill
 from weather_aug.clip.street_parts import joined
 from weather_aug.clip.street_path import Ego, curve_of, ego_at
 from weather_aug.clip.street_rays import World, world_of
+from weather_aug.clip.street_surface import Looks, Setting
 from weather_aug.clip.street_texture import noise_tile
 from weather_aug.clip.street_traffic import movers
 from weather_aug.clip.types import Box, Camera, Float64, Frame, FrameKey
@@ -178,7 +179,7 @@ def camera_at(ego: Ego, name: str, width: int, height: int) -> Camera:
 
 class _Stage(NamedTuple):
     world: World
-    surfaces: Surfaces
+    looks: Looks
     setting: Setting
     actors: tuple[Actor, ...]
 
@@ -197,7 +198,7 @@ def _stage(seed: int, time_index: int) -> _Stage:
     parts = joined([*(piece.scenery for piece in chunks), *(actor.parts for actor in actors)])
     return _Stage(
         world=world_of(parts),
-        surfaces=Surfaces(parts.material, parts.label, parts.look),
+        looks=Looks(parts.material, parts.label, parts.look),
         setting=Setting(curve, SECTION, noise_tile(), _suns()),
         actors=tuple(actors),
     )
@@ -228,7 +229,7 @@ def _drawn(stage: _Stage, camera: Camera) -> Canvas:
         focal_px=camera.focal_px[0],
         principal_px=np.array(camera.principal_px),
     )
-    fill(stage.world, stage.surfaces, stage.setting, rig, canvas)
+    fill(stage.world, stage.looks, stage.setting, rig, canvas)
     return canvas
 
 

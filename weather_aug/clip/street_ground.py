@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug.clip.street_path import Section
-from weather_aug.clip.street_shapes import hash3, unit_of
+from weather_aug.clip.street_shapes import draws_of
 from weather_aug.clip.street_texture import band, grain, mixed, noise, smooth, stripe, times
 
 Float32 = NDArray[np.float32]
@@ -29,7 +29,7 @@ def is_planted(section: Section, x: float, offset: float) -> bool:
     if since < section.crossing_width_m + 2.0 or since > section.crossing_period_m - 2.0:
         return False
     cell = math.floor(x / 6.0)
-    paved = unit_of(hash3(cell, 1 if offset > 0 else 2, 0, 77), 0) < 0.22
+    paved = draws_of(cell, cell, 1 if offset > 0 else 2, 77.0)[0] < 0.22
     return not paved
 
 
@@ -70,11 +70,11 @@ def _asphalt(
     tone *= 1.0 + 0.09 * math.exp(-((abs(lane) - 0.75) ** 2) * 9.0)
     tone *= 1.0 - 0.12 * math.exp(-lane * lane * 10.0)
     cell = math.floor(x / 14.0)
-    word = hash3(cell, math.floor(offset / 3.5), 3, 5)
-    if unit_of(word, 0) < 0.30:
-        length = 2.0 + 6.0 * unit_of(word, 10)
-        low = cell * 14.0 + 4.0 * unit_of(word, 20)
-        base = math.floor(offset / 3.5) * 3.5 + 0.3 + 0.9 * unit_of(word, 30)
+    word = draws_of(cell, math.floor(offset / 3.5), cell, 5.0)
+    if word[0] < 0.30:
+        length = 2.0 + 6.0 * word[1]
+        low = cell * 14.0 + 4.0 * word[2]
+        base = math.floor(offset / 3.5) * 3.5 + 0.3 + 0.9 * word[3]
         patch = band(x, low, low + length, fx) * band(offset, base, base + 1.6, fd)
         seam = patch - band(x, low + 0.04, low + length - 0.04, fx) * band(
             offset, base + 0.04, base + 1.56, fd
@@ -104,15 +104,15 @@ def _slabs(tile: Float32, x: float, offset: float, fx: float, fd: float) -> Colo
     row = math.floor(offset / 0.6)
     shifted = x + 0.3 * (row & 1)
     fade = smooth(1.2, 0.2, f)
-    word = hash3(math.floor(shifted / 0.6), row, 1, 9)
-    tone = 0.330 * (1.0 + fade * 0.22 * (unit_of(word, 0) - 0.5))
+    word = draws_of(math.floor(shifted / 0.6), row, row, 9.0)
+    tone = 0.330 * (1.0 + fade * 0.22 * (word[0] - 0.5))
     tone *= 1.0 + 0.20 * noise(tile, x, offset, 9.0, f) + 0.20 * grain(tile, x, offset, 1.3, f)
     joint = max(stripe(shifted, 0.6, 0.0, 0.016, fx), stripe(offset, 0.6, 0.0, 0.016, fd))
     tone *= 1.0 - 0.55 * joint
     # Chewing gum and drips.
     spot = smooth(0.52, 0.66, noise(tile, x, offset, 3.1, f))
     tone *= 1.0 - 0.22 * spot
-    warm = 0.03 * (unit_of(word, 10) - 0.5) * fade
+    warm = 0.03 * (word[1] - 0.5) * fade
     return tone * (1.02 + warm), tone * 0.985, tone * (0.93 - warm)
 
 

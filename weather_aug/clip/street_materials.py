@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug.clip.street_facade import brickwork, facade_paint, roof_paint
-from weather_aug.clip.street_shapes import hash3, unit_of
+from weather_aug.clip.street_shapes import draws_of
 from weather_aug.clip.street_texture import band, mixed, noise, smooth, stripe, times
 
 Float32 = NDArray[np.float32]
@@ -41,12 +41,12 @@ def _car_body(
         colour = mixed(colour, (0.012, 0.012, 0.013), dark)
         mirror *= 1.0 - dark
     elif nx > 0.5:
-        lamp = band(abs(y), width - 0.46, width - 0.10, f) * band(z, 0.56, 0.70, f)
+        lamp = band(abs(y), width - 0.44, width - 0.12, f) * band(z, 0.57, 0.68, f)
         grille = band(abs(y), -1.0, 0.42, f) * band(z, 0.38, 0.60, f)
         grille *= 0.75 + 0.25 * stripe(z, 0.05, 0.0, 0.03, f)
         plate = band(abs(y), -1.0, 0.26, f) * band(z, 0.40, 0.50, f)
         colour = mixed(colour, (0.015, 0.015, 0.016), max(grille, band(z, 0.0, 0.30, f)))
-        colour = mixed(mixed(colour, (0.70, 0.70, 0.66), plate), (0.80, 0.82, 0.85), lamp)
+        colour = mixed(mixed(colour, (0.70, 0.70, 0.66), plate), (0.48, 0.50, 0.53), lamp)
         mirror += 0.25 * lamp
     elif nx < -0.5:
         lamp = band(abs(y), width - 0.42, width - 0.08, f) * band(z, 0.60, 0.80, f)
@@ -75,7 +75,10 @@ def _car_cabin(
         glass *= band(x, low, high, f) * (1.0 - band(x, middle - 0.05, middle + 0.05, f))
     else:
         glass *= band(abs(y), -1.0, 0.72 - 0.24 * rise, f)
-    inner = 0.016 + 0.03 * smooth(0.5, 0.0, rise) * unit_of(hash3(int(look[7]), 1, 1, 1), 0)
+    inner = (
+        0.016
+        + 0.03 * smooth(0.5, 0.0, rise) * draws_of(int(look[7]), int(look[7]), int(look[7]), 1.0)[0]
+    )
     colour = mixed(colour, (inner, inner, inner * 1.1), glass)
     return colour[0], colour[1], colour[2], 0.07 + 0.13 * glass
 
@@ -125,13 +128,12 @@ def _sign(look: Float64, y: float, z: float, front: bool, f: float) -> Paint:
     white, red, blue, black = (0.80, 0.80, 0.78), (0.55, 0.02, 0.02), (0.02, 0.10, 0.42), 0.02
     if kind == 0:
         colour = mixed(red, white, band(r, -1.0, radius * 0.76, f))
-        ink = band(abs(z), -1.0, radius * 0.40, f) * stripe(
-            abs(y) - 0.04 * radius, radius * 0.44, radius * 0.05, radius * 0.19, f
-        )
-        hole = band(abs(z), -1.0, radius * 0.22, f) * band(abs(y), -1.0, radius * 0.46, f)
-        bars = max(ink, band(abs(abs(z) - radius * 0.34), -1.0, radius * 0.07, f))
-        ink = bars * band(abs(y), radius * 0.05, radius * 0.48, f)
-        ink *= band(abs(z), -1.0, radius * 0.42, f) * (1.0 - 0.2 * hole)
+        # A thirty: two right halves of rings, then an oval; the reader's right is -y.
+        right, unit = -y / radius, f / radius
+        rounds = abs(math.hypot(right + 0.24, abs(z) / radius - 0.17) - 0.16)
+        three = band(rounds, -1.0, 0.055, unit) * band(right, -0.27, 1.0, unit)
+        oval = abs(math.hypot((right - 0.24) * 1.75, z / radius) - 0.31)
+        ink = max(three, band(oval, -1.0, 0.075, unit))
         colour = mixed(colour, (black, black, black), ink)
     elif kind == 1:
         colour = mixed(white, blue, band(r, -1.0, radius * 0.93, f))
@@ -212,8 +214,9 @@ def _bark(tile: Float32, look: Float64, x: float, y: float, z: float, f: float) 
 @numba.njit(cache=True, nogil=True)
 def _wood(tile: Float32, look: Float64, u: float, z: float, fu: float, fv: float) -> Paint:
     f = math.sqrt(fu * fv)
-    plank = hash3(math.floor(u / 0.14), 2, 2, int(look[7]))
-    tint = 1.0 + 0.35 * (unit_of(plank, 0) - 0.5) * smooth(0.3, 0.05, fu)
+    plank_index = math.floor(u / 0.14)
+    plank = draws_of(plank_index, plank_index, plank_index, look[7])
+    tint = 1.0 + 0.35 * (plank[0] - 0.5) * smooth(0.3, 0.05, fu)
     tint *= 1.0 + 0.45 * noise(tile, u * 5.0, z * 0.5, 1.7, f)
     tint *= 1.0 - 0.75 * stripe(u, 0.14, 0.0, 0.014, fu)
     colour = times((look[0], look[1], look[2]), tint)

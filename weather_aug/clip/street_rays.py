@@ -31,7 +31,7 @@ class World(NamedTuple):
     frame: Float64
     shape: Float64
     planes: Float64
-    seed: Int64
+    seed: Float64
     """(N,)"""
     ball: Float64
     """(N, 4): centre and squared radius of a sphere around each part, world."""
@@ -71,7 +71,7 @@ def world_of(parts: Parts) -> World:
         frame=parts.frame,
         shape=parts.shape,
         planes=parts.planes if len(parts.planes) else np.zeros((1, 4)),
-        seed=parts.look[:, 7].astype(np.int64),
+        seed=np.ascontiguousarray(parts.look[:, 7]),
         ball=ball,
         start=start,
         item=item,
@@ -82,28 +82,21 @@ def world_of(parts: Parts) -> World:
     )
 
 
-@numba.njit(cache=True, nogil=True)
 def _filled(first: Int64, last: Int64, size: Int64, top: Float64) -> tuple[Int64, Int64, Float64]:
-    cells = size[0] * size[1]
+    """List the parts of each cell, from the ranges of cells that each part covers."""
+    extent = last - first + 1
+    count = extent[:, 0] * extent[:, 1]
+    part = np.repeat(np.arange(len(count)), count)
+    number = np.arange(len(part)) - np.repeat(np.cumsum(count) - count, count)
+    wide = extent[part, 0]
+    cell = (first[part, 1] + number // wide) * size[0] + first[part, 0] + number % wide
+    order = np.argsort(cell, kind="stable")
+    cells = int(size[0] * size[1])
     start = np.zeros(cells + 1, np.int64)
+    np.cumsum(np.bincount(cell, minlength=cells), out=start[1:])
     top_m = np.zeros(cells)
-    for i in range(len(first)):
-        for cy in range(first[i, 1], last[i, 1] + 1):
-            for cx in range(first[i, 0], last[i, 0] + 1):
-                cell = cy * size[0] + cx
-                start[cell + 1] += 1
-                top_m[cell] = max(top_m[cell], top[i])
-    for cell in range(cells):
-        start[cell + 1] += start[cell]
-    cursor = start[:-1].copy()
-    item = np.empty(start[cells], np.int64)
-    for i in range(len(first)):
-        for cy in range(first[i, 1], last[i, 1] + 1):
-            for cx in range(first[i, 0], last[i, 0] + 1):
-                cell = cy * size[0] + cx
-                item[cursor[cell]] = i
-                cursor[cell] += 1
-    return start, item, top_m
+    np.maximum.at(top_m, cell, top[part])
+    return start, part[order], top_m
 
 
 @numba.njit(cache=True, nogil=True, forceinline=True)
@@ -126,16 +119,18 @@ def first_part(
     dy: float,
     dz: float,
     limit: float,
-    shadow: bool,
 ) -> Hit:
     """Return the nearest part before `limit`: (t, index), or (limit, -1).
 
-    A `shadow` ray stops at the first part it finds, also one that it starts in, with t = 0.
+    A negative limit makes it a shadow ray: it stops at any part, also one that it starts in.
 
     Source:
         Amanatides and Woo, A Fast Voxel Traversal Algorithm, 1987.
     """
     h = 2.5
+    shadow = limit < 0.0
+    if shadow:
+        limit = math.inf
     px, py = ox - world.corner[0], oy - world.corner[1]
     nx, ny = world.size[0], world.size[1]
     t, stop = 0.0, limit
@@ -193,7 +188,7 @@ def first_part(
                 if near > far:
                     continue
                 if shadow:
-                    if far > 0.0 and near < best:
+                    if far > 0.0:
                         return 0.0, i
                 elif 0.0 < near < best:
                     best, found = near, i

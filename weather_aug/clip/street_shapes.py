@@ -16,25 +16,33 @@ Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 Vector = tuple[float, float, float]
 Span = tuple[float, float]
+Draws = tuple[float, float, float, float, float, float]
 
 
 @numba.njit(cache=True, nogil=True)
-def hash3(x: int, y: int, z: int, seed: int) -> np.uint64:
-    """Mix four integers into 64 bits (the finaliser of splitmix64 after odd multipliers)."""
+def draws_of(x: int, y: int, z: int, seed: float) -> Draws:
+    """Return six numbers in [0, 1), steps of 1/1024, that depend on a cell and a whole seed alone.
+
+    The hash is the finaliser of splitmix64 behind odd multipliers. The seed comes as a float
+    because that is how the parts carry it (and because numba compiles anew for each literal int).
+    """
     h = (
         np.uint64(x) * np.uint64(0x9E3779B97F4A7C15)
         ^ np.uint64(y) * np.uint64(0xC2B2AE3D27D4EB4F)
         ^ np.uint64(z) * np.uint64(0x165667B19E3779F9)
-    ) + np.uint64(seed) * np.uint64(0xD6E8FEB86659FD93)
+    ) + np.uint64(int(seed)) * np.uint64(0xD6E8FEB86659FD93)
     h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return h ^ (h >> np.uint64(31))
-
-
-@numba.njit(cache=True, nogil=True)
-def unit_of(word: np.uint64, shift: int) -> float:
-    """Ten bits of a hash word from bit `shift` on, as a number in [0, 1)."""
-    return float((word >> np.uint64(shift)) & np.uint64(1023)) / 1024.0
+    h = h ^ (h >> np.uint64(31))
+    mask, step = np.uint64(1023), 1.0 / 1024.0
+    return (
+        float(h & mask) * step,
+        float((h >> np.uint64(10)) & mask) * step,
+        float((h >> np.uint64(20)) & mask) * step,
+        float((h >> np.uint64(30)) & mask) * step,
+        float((h >> np.uint64(40)) & mask) * step,
+        float((h >> np.uint64(50)) & mask) * step,
+    )
 
 
 @numba.njit(cache=True, nogil=True)
@@ -172,7 +180,7 @@ def leaf_hit(
     dy: float,
     dz: float,
     s: Float64,
-    seed: int,
+    seed: float,
     t0: float,
     t1: float,
 ) -> tuple[float, float, float, float, float]:
@@ -196,15 +204,15 @@ def leaf_hit(
         leave = min(tx, ty, tz, t1)
         best, bx, by, bz, tint = math.inf, 0.0, 0.0, 1.0, 0.0
         for k in range(3):
-            word = hash3(ix, iy, iz, seed * 4 + k)
-            cx = (ix + unit_of(word, 0)) * h
-            cy = (iy + unit_of(word, 10)) * h
-            cz = (iz + unit_of(word, 20)) * h
+            word = draws_of(ix, iy, iz, seed * 4.0 + k)
+            cx = (ix + word[0]) * h
+            cy = (iy + word[1]) * h
+            cz = (iz + word[2]) * h
             qx, qy, qz = (cx - s[0]) / s[3], (cy - s[1]) / s[4], (cz - s[2]) / s[5]
             # Fewer leaves towards the rim, and none in random holes, make the outline ragged.
-            if qx * qx + qy * qy + qz * qz > 0.55 + 0.5 * unit_of(word, 30):
+            if qx * qx + qy * qy + qz * qz > 0.55 + 0.5 * word[3]:
                 continue
-            nx, ny = 2.0 * unit_of(word, 40) - 1.0, 2.0 * unit_of(word, 50) - 1.0
+            nx, ny = 2.0 * word[4] - 1.0, 2.0 * word[5] - 1.0
             nz = 1.25 - abs(nx) * 0.8 - abs(ny) * 0.4
             speed = nx * dx + ny * dy + nz * dz
             if abs(speed) < 1e-9:
@@ -217,7 +225,7 @@ def leaf_hit(
             square = px * px + py * py + pz * pz
             width = 0.062 * (1.0 - along * along * 60.0)
             if width > 0.0 and square - along * along < width * width:
-                best, bx, by, bz, tint = hit, nx, ny, nz, unit_of(word, 4)
+                best, bx, by, bz, tint = hit, nx, ny, nz, word[2]
         if best < math.inf:
             scale = 1.0 / math.sqrt(bx * bx + by * by + bz * bz)
             if bx * dx + by * dy + bz * dz > 0.0:
@@ -244,7 +252,7 @@ def span(
     dz: float,
     s: Float64,
     planes: Float64,
-    seed: int,
+    seed: float,
     limit: float,
 ) -> Span:
     """Return where a ray in the object's frame enters and leaves a part; (inf, -inf) if nowhere.

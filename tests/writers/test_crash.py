@@ -148,8 +148,8 @@ def test_killed_at_any_call_it_can_be_continued(
     small: ExportPlan, small_tree: dict[str, str], tmp_path: Path, finished: bool, every: int
 ) -> None:
     """Once from nothing, once while a damaged export is being repaired."""
-    # From call 2 in steps of 4, each kind of call is met in time: they recur in runs of 5.
-    call, status = 2 - every, 1
+    # A written file is five calls, so steps of four meet each kind of call in turn.
+    call, status = 1 - every, 1
     while status != 0:
         call += every
         out = tmp_path / str(call)

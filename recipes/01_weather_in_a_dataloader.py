@@ -1,6 +1,6 @@
 """Weather of each sample drawn on the fly, in a torch DataLoader.
 
-    python recipes/01_weather_in_a_dataloader.py
+python recipes/01_weather_in_a_dataloader.py
 """
 
 from __future__ import annotations

@@ -146,8 +146,8 @@ class Taxonomy:
 
 def _taxonomies() -> dict[str, Taxonomy]:
     train = {**dict(enumerate(CLASSES)), IGNORE: None}
-    cityscapes: dict[int, str | None] = {i: None for i in range(35)} | {255: None}
-    cityscapes |= _CITYSCAPES_IDS
+    unlabelled = dict.fromkeys((*range(35), 255))
+    cityscapes: dict[int, str | None] = {**unlabelled, **_CITYSCAPES_IDS}
     camvid: dict[int, str | None] = dict(enumerate(_CAMVID_11)) | {11: None, 255: None}
     return {
         "train_ids": Taxonomy("train_ids", train),

@@ -7,27 +7,28 @@ from render_scene import make_camera, make_frame
 from scipy.integrate import quad
 
 from weather_aug.colour import SRGB_LEVELS_LINEAR
-from weather_aug.render import kernels
 from weather_aug.render.compose import RenderOptions, render
+from weather_aug.render.medium import survival
+from weather_aug.render.shade import encode_row
 from weather_aug.weather import Weather
 
 
 def test_survival_is_the_exponential():
     depths = np.linspace(-8, 60, 20_001).astype(np.float32)
-    actual = np.array([kernels.survival(x) for x in depths])
+    actual = np.array([survival(x) for x in depths])
     np.testing.assert_allclose(np.exp(-depths.astype(float)), actual, rtol=5e-5, atol=1e-9)
 
 
 def test_every_level_survives_decoding_and_encoding():
     light = SRGB_LEVELS_LINEAR.astype(np.float32)
-    kernels.encode_row(light)
+    encode_row(light)
     np.testing.assert_array_equal(np.arange(256), np.floor(light))
 
 
 def test_encoding_is_srgb_to_a_tenth_of_a_level():
     light = np.linspace(0, 1, 100_001)
     actual = light.astype(np.float32)
-    kernels.encode_row(actual)
+    encode_row(actual)
     assert np.abs(actual - 0.5 - srgb(light)).max() < 0.1
 
 

@@ -6,12 +6,16 @@ from oracles import reference_render as reference
 from render_scene import make_camera, make_frame
 
 from weather_aug.particles import statistics
-from weather_aug.render import compose, kernels
+from weather_aug.render import compose
 from weather_aug.render.compose import RenderOptions, render
+from weather_aug.render.medium import Medium
+from weather_aug.render.project import BAND_ROWS, order_by_band
+from weather_aug.render.project import project as project_kernel
+from weather_aug.render.shade import Tone, shade
 from weather_aug.weather import Weather
 
 UP = np.array([0.0, 0, 1])
-CLEAR_AIR = kernels.Medium(*(np.float32(v) for v in (0, 0, 0, 0, 60 / 1024)))
+CLEAR_AIR = Medium(*(np.float32(v) for v in (0, 0, 0, 0, 60 / 1024)))
 NOTHING_RESOLVED = np.zeros(1025, np.float32)
 
 
@@ -21,7 +25,7 @@ def project(particles, camera, window=None):
     window = window or (0, 0, camera.height, camera.width)
     white = np.ones(3, np.float32)
     optics = compose._optics(camera, UP)
-    count = kernels.project(
+    count = project_kernel(
         particles, optics, CLEAR_AIR, NOTHING_RESOLVED, white, white, window, splats
     )
     return splats[:count]
@@ -32,10 +36,10 @@ def transmittance(particles, camera, depth_m=1000.0):
     height, width = camera.height, camera.width
     window = (0, 0, height, width)
     splats = project(particles, camera)
-    order, band_starts = kernels.order_by_band(splats, window, -(-height // kernels.BAND_ROWS))
+    order, band_starts = order_by_band(splats, window, -(-height // BAND_ROWS))
     through = np.empty((height, width), np.float32)
     zero = np.float32(0)
-    kernels.compose(
+    shade(
         np.zeros((height, width, 3), np.uint8),
         np.full((height, width), depth_m, np.float32),
         np.zeros((height, width), bool),
@@ -45,7 +49,7 @@ def transmittance(particles, camera, depth_m=1000.0):
         NOTHING_RESOLVED,
         np.zeros(256, np.float32),
         np.eye(3, dtype=np.float32),
-        kernels.Tone(zero, np.float32(1), zero),
+        Tone(zero, np.float32(1), zero),
         np.ones(3, np.float32),
         splats,
         order,

@@ -15,9 +15,10 @@ al. 2014, "Fast Global Image Smoothing".
 from __future__ import annotations
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from weather_aug._compiled import compiled
 
 Float32 = NDArray[np.float32]
 
@@ -118,7 +119,7 @@ def _solved(
     return solution
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _coarser(
     weighted: Float32, confidence: Float32, across: Float32, down: Float32
 ) -> tuple[Float32, Float32, Float32, Float32]:
@@ -153,7 +154,7 @@ def _coarser(
     return coarse_weighted, coarse_confidence, coarse_across, coarse_down
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _relaxed(
     start: Float32,
     weighted: Float32,

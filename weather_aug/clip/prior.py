@@ -11,11 +11,11 @@ from __future__ import annotations
 import math
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug._checks import finite
+from weather_aug._compiled import compiled
 from weather_aug.errors import ArgumentError
 from weather_aug.taxonomy import CLASSES, GROUND, IGNORE, SKY, TRAIN_ID
 
@@ -144,7 +144,7 @@ def _regions(classes: NDArray[np.uint8]) -> tuple[Int32, NDArray[np.uint8]]:
     return numbered, np.concatenate(kinds)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _stood_up(
     classes: NDArray[np.uint8],
     regions: Int32,
@@ -223,7 +223,7 @@ def _stood_up(
     return depth
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _ground_at(row: np.float32, ground: Float32) -> np.float32:
     """Ground depth at a fractional row; inverse depth is linear in the row."""
     below = min(int(row), len(ground) - 1)
@@ -233,7 +233,7 @@ def _ground_at(row: np.float32, ground: Float32) -> np.float32:
     return np.float32(np.float32(1.0) / inverse)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _feet(
     bottom: Int32,
     tall: Int32,
@@ -287,7 +287,7 @@ def _feet(
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _spread(foot: Float32) -> None:
     """Give columns without a visible contact (-1) that of the nearest column that has one."""
     span = len(foot)
@@ -311,7 +311,7 @@ def _spread(foot: Float32) -> None:
         foot[place] = value[place]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _ungrounded(
     region: int,
     kind_by_region: NDArray[np.uint8],

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug._checks import finite, image_uint8, like_image
+from weather_aug._compiled import compiled
 from weather_aug.clip.completion import completed, sharpened
 from weather_aug.clip.sky import sky_mask, texture
 from weather_aug.errors import ArgumentError
@@ -159,7 +159,7 @@ def _dense(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray((cv2.blur(share, (9, 9)) > 0.5) | (cv2.blur(share, (3, 15)) > 0.6))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _from_background(
     disparity_px: Float32, trusted: NDArray[np.bool_]
 ) -> tuple[Float32, NDArray[np.bool_]]:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from weather_aug._compiled import compiled
 from weather_aug.clip.street_light import seen, sky
 from weather_aug.clip.street_rays import World, first_part, ground_hit
 from weather_aug.clip.street_surface import Looks, Setting, ground_surface, part_surface
@@ -43,7 +43,7 @@ class Canvas(NamedTuple):
     """(H, W, 3); zero for the sky."""
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _display(value: float) -> int:
     """Return the sRGB byte of a linear value, highlights rolled off above 0.7."""
     if value > 0.7:
@@ -55,7 +55,7 @@ def _display(value: float) -> int:
     return int(encoded * 255.0 + 0.5)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def fill(world: World, looks: Looks, setting: Setting, rig: Rig, canvas: Canvas) -> None:
     """Fill a canvas: colour from four rays a pixel, everything else from the one at its centre."""
     height, width = canvas.label.shape

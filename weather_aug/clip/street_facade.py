@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from weather_aug._compiled import compiled
 from weather_aug.clip.street_shapes import draws_of
 from weather_aug.clip.street_texture import band, grain, mixed, noise, smooth, stripe, times
 
@@ -18,7 +18,7 @@ Draws = tuple[float, float, float, float, float, float]
 Paint = tuple[float, float, float, float]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def brickwork(tile: Float32, albedo: Colour, u: float, z: float, fu: float, fv: float) -> Colour:
     """Return the albedo of a brick wall: rows of 7.5 cm, bricks of 25 cm, mortar of 1 cm."""
     row = math.floor(z / 0.075)
@@ -33,7 +33,7 @@ def brickwork(tile: Float32, albedo: Colour, u: float, z: float, fu: float, fv: 
     return mixed(times(albedo, tint), (grey, grey * 0.96, grey * 0.9), mortar * 0.8)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _wall(
     tile: Float32, look: Float64, u: float, z: float, height: float, fu: float, fv: float
 ) -> Colour:
@@ -53,7 +53,7 @@ def _wall(
     return times(colour, (1.0 - streak * damp) * (1.0 - 0.32 * splash))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _goods(tile: Float32, key: float, x: float, y: float, fu: float, fv: float) -> Colour:
     """Return what stands in a shop window: shelves of coloured things under warm lamps."""
     f = math.sqrt(fu * fv)
@@ -71,7 +71,7 @@ def _goods(tile: Float32, key: float, x: float, y: float, fu: float, fv: float) 
     return mixed(back, colour, shown * (1.0 if thing[4] < 0.75 else 0.0))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _window(
     tile: Float32,
     word: Draws,
@@ -121,7 +121,7 @@ def _window(
     return colour[0], colour[1], colour[2], 0.30 * glass * opening * (1.0 - 0.5 * shade)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _street_level(
     tile: Float32,
     look: Float64,
@@ -176,7 +176,7 @@ def _street_level(
     return _window(tile, word, base, frame, x, z - 1.15, 0.29 * bay_width, 1.75, 2.0, fu, fv)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def facade_paint(
     tile: Float32, look: Float64, u: float, z: float, front: bool, fu: float, fv: float
 ) -> Paint:
@@ -228,7 +228,7 @@ def facade_paint(
     return _window(tile, word, colour, frame, x, y - 0.24 * storey, half, tall, panes, fu, fv)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def roof_paint(tile: Float32, look: Float64, u: float, v: float, fu: float, fv: float) -> Colour:
     """Return the albedo of roof tiles; v runs down the slope, metres."""
     f = math.sqrt(fu * fv)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from weather_aug._compiled import compiled
 from weather_aug.clip.street_path import Section
 from weather_aug.clip.street_shapes import draws_of
 from weather_aug.clip.street_texture import band, grain, mixed, noise, smooth, stripe, times
@@ -16,7 +16,7 @@ Float32 = NDArray[np.float32]
 Colour = tuple[float, float, float]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def is_planted(section: Section, x: float, offset: float) -> bool:
     """Tell whether a point beside the road is grass: the strip with the trees, or a garden."""
     a = abs(offset)
@@ -33,7 +33,7 @@ def is_planted(section: Section, x: float, offset: float) -> bool:
     return not paved
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _marks(section: Section, x: float, offset: float, fx: float, fd: float) -> float:
     """Return the share of the footprint that is white paint."""
     a = abs(offset)
@@ -55,7 +55,7 @@ def _marks(section: Section, x: float, offset: float, fx: float, fd: float) -> f
     return min(white, 1.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _asphalt(
     tile: Float32, section: Section, x: float, offset: float, fx: float, fd: float
 ) -> Colour:
@@ -89,7 +89,7 @@ def _asphalt(
     return mixed(colour, (stone, stone * 0.98, stone * 0.95), gutter)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _grass(tile: Float32, x: float, y: float, f: float) -> Colour:
     broad = noise(tile, x, y, 13.0, f)
     fine = 0.5 * noise(tile, x, y, 2.3, f) + 0.5 * grain(tile, x, y, 1.9, f)
@@ -98,7 +98,7 @@ def _grass(tile: Float32, x: float, y: float, f: float) -> Colour:
     return times(mixed(green, (0.16, 0.125, 0.085), bare), 1.0 + 0.8 * fine)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _slabs(tile: Float32, x: float, offset: float, fx: float, fd: float) -> Colour:
     f = math.sqrt(fx * fd)
     row = math.floor(offset / 0.6)
@@ -116,7 +116,7 @@ def _slabs(tile: Float32, x: float, offset: float, fx: float, fd: float) -> Colo
     return tone * (1.02 + warm), tone * 0.985, tone * (0.93 - warm)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def ground_paint(
     tile: Float32,
     section: Section,

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from weather_aug._compiled import compiled, inlined
 from weather_aug.clip.street_rays import World, first_part
 from weather_aug.clip.street_surface import Surface
 from weather_aug.clip.street_texture import mixed, noise, smooth
@@ -21,7 +21,7 @@ Colour = tuple[float, float, float]
 Vector = tuple[float, float, float]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def sky(tile: Float32, sun: Float64, x: float, y: float, z: float) -> Colour:
     """Return the light of the sky from a unit direction."""
     up = max(z, 0.0)
@@ -37,7 +37,7 @@ def sky(tile: Float32, sun: Float64, x: float, y: float, z: float) -> Colour:
     return mixed(blue, cloud, density * (0.35 + 0.6 * smooth(0.0, 0.25, up)))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _mirrored(tile: Float32, sun: Float64, x: float, y: float, z: float) -> Colour:
     """Return what a mirror sees that looks along a unit direction: sky, houses or road."""
     above = sky(tile, sun, x, y, max(z, 0.05))
@@ -49,7 +49,7 @@ def _mirrored(tile: Float32, sun: Float64, x: float, y: float, z: float) -> Colo
     return mixed(low, above, smooth(skyline - 0.04, skyline + 0.04, z))
 
 
-@numba.njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def _lit(
     sun: Float64,
     albedo: Colour,
@@ -68,7 +68,7 @@ def _lit(
     )
 
 
-@numba.njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def _sun_reaches(world: World, sun: Float64, x: float, y: float, z: float, n: Vector) -> float:
     if n[0] * sun[0] + n[1] * sun[1] + n[2] * sun[2] <= 0.0:
         return 0.0
@@ -86,7 +86,7 @@ def _sun_reaches(world: World, sun: Float64, x: float, y: float, z: float, n: Ve
     return 0.0 if found >= 0 else 1.0
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def seen(
     world: World,
     tile: Float32,

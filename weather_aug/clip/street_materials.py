@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from weather_aug._compiled import compiled
 from weather_aug.clip.street_facade import brickwork, facade_paint, roof_paint
 from weather_aug.clip.street_shapes import draws_of
 from weather_aug.clip.street_texture import band, mixed, noise, smooth, stripe, times
@@ -21,7 +21,7 @@ Colour = tuple[float, float, float]
 Paint = tuple[float, float, float, float]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _car_body(
     tile: Float32, look: Float64, x: float, y: float, z: float, nx: float, ny: float, f: float
 ) -> Paint:
@@ -58,7 +58,7 @@ def _car_body(
     return colour[0], colour[1], colour[2], mirror
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _car_cabin(
     look: Float64, x: float, y: float, z: float, nx: float, ny: float, nz: float, f: float
 ) -> Paint:
@@ -83,7 +83,7 @@ def _car_cabin(
     return colour[0], colour[1], colour[2], 0.07 + 0.13 * glass
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _coach(
     tile: Float32, look: Float64, x: float, y: float, z: float, nx: float, ny: float, f: float
 ) -> Paint:
@@ -118,7 +118,7 @@ def _coach(
     return colour[0], colour[1], colour[2], mirror + 0.15 * glass
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _sign(look: Float64, y: float, z: float, front: bool, f: float) -> Paint:
     """Paint a plate; y, z from its middle; detail: kind, radius or half width, half height."""
     if not front:
@@ -155,7 +155,7 @@ def _sign(look: Float64, y: float, z: float, front: bool, f: float) -> Paint:
     return colour[0], colour[1], colour[2], 0.04
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _signal(look: Float64, y: float, z: float, front: bool, f: float) -> Paint:
     """Paint a traffic light's housing; y, z from its middle; detail: which lamp is lit."""
     colour, mirror = (0.022, 0.026, 0.024), 0.04
@@ -171,7 +171,7 @@ def _signal(look: Float64, y: float, z: float, front: bool, f: float) -> Paint:
     return colour[0], colour[1], colour[2], mirror
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _tyre(s: Float64, x: float, y: float, z: float, ny: float, f: float) -> Paint:
     r = math.hypot(x - s[0], z - s[2]) / s[3]
     colour = (0.022, 0.022, 0.023)
@@ -184,14 +184,14 @@ def _tyre(s: Float64, x: float, y: float, z: float, ny: float, f: float) -> Pain
     return colour[0], colour[1], colour[2], 0.03
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _fabric(tile: Float32, look: Float64, x: float, y: float, z: float, f: float) -> Paint:
     fold = noise(tile, x * 2.0 + y, z + look[7], 1.6, f) + 0.6 * noise(tile, x - y, z, 0.35, f)
     colour = times((look[0], look[1], look[2]), 1.0 + look[3] * 0.55 * fold)
     return colour[0], colour[1], colour[2], 0.01
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _plain(
     tile: Float32, look: Float64, u: float, z: float, fu: float, fv: float, rough: float
 ) -> Paint:
@@ -201,7 +201,7 @@ def _plain(
     return colour[0], colour[1], colour[2], look[3]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _bark(tile: Float32, look: Float64, x: float, y: float, z: float, f: float) -> Paint:
     around = math.atan2(y, x) * 0.25
     ridge = noise(tile, around * 3.0, z * 0.5, 0.7, f) + 0.6 * noise(tile, around, z, 0.25, f)
@@ -211,7 +211,7 @@ def _bark(tile: Float32, look: Float64, x: float, y: float, z: float, f: float) 
     return colour[0], colour[1], colour[2], 0.0
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _wood(tile: Float32, look: Float64, u: float, z: float, fu: float, fv: float) -> Paint:
     f = math.sqrt(fu * fv)
     plank_index = math.floor(u / 0.14)
@@ -223,7 +223,7 @@ def _wood(tile: Float32, look: Float64, u: float, z: float, fu: float, fv: float
     return colour[0], colour[1], colour[2], 0.0
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def paint(
     tile: Float32,
     material: int,

@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from weather_aug._compiled import compiled
 from weather_aug._keys import key_of, uniforms
 
 Float64 = NDArray[np.float64]
@@ -72,14 +72,14 @@ def curve_of(seed: int) -> Curve:
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def centre_y(curve: Curve, x: float) -> float:
     """Height y of the centre line at x, metres."""
     wide = curve.wide_m * math.sin(curve.wide_rad_per_m * x + curve.wide_phase_rad)
     return wide + curve.fine_m * math.sin(curve.fine_rad_per_m * x + curve.fine_phase_rad)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def centre_slope(curve: Curve, x: float) -> float:
     """Slope dy/dx of the centre line at x."""
     wide = curve.wide_m * curve.wide_rad_per_m

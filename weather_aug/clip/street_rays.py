@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from weather_aug._compiled import inlined
 from weather_aug.clip.street_parts import Parts
 from weather_aug.clip.street_path import Curve, Section, centre_y
 from weather_aug.clip.street_shapes import span
@@ -99,7 +99,7 @@ def _filled(first: Int64, last: Int64, size: Int64, top: Float64) -> tuple[Int64
     return start, part[order], top_m
 
 
-@numba.njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def cell_of(world: World, x: float, y: float) -> int:
     """Return the index of the cell over a point of the ground, -1 outside the grid."""
     cx = math.floor((x - world.corner[0]) / 2.5)
@@ -109,7 +109,7 @@ def cell_of(world: World, x: float, y: float) -> int:
     return -1
 
 
-@numba.njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def first_part(
     world: World,
     ox: float,
@@ -202,7 +202,7 @@ def first_part(
     return best, found
 
 
-@numba.njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def ground_hit(
     curve: Curve,
     section: Section,

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from weather_aug._compiled import compiled
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -19,7 +20,7 @@ Span = tuple[float, float]
 Draws = tuple[float, float, float, float, float, float]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def draws_of(x: int, y: int, z: int, seed: float) -> Draws:
     """Return six numbers in [0, 1), steps of 1/1024, that depend on a cell and a whole seed alone.
 
@@ -45,21 +46,21 @@ def draws_of(x: int, y: int, z: int, seed: float) -> Draws:
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def into_frame(frame: Float64, i: int, x: float, y: float) -> Span:
     """Turn the horizontal part of a world direction into the object's axes."""
     c, s = frame[i, 3], frame[i, 4]
     return c * x + s * y, c * y - s * x
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def out_of_frame(frame: Float64, i: int, x: float, y: float) -> Span:
     """Turn the horizontal part of an object's direction into world axes."""
     c, s = frame[i, 3], frame[i, 4]
     return c * x - s * y, s * x + c * y
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _slab(o: float, d: float, half: float) -> Span:
     if abs(d) < 1e-12:
         return (-math.inf, math.inf) if abs(o) <= half else (math.inf, -math.inf)
@@ -67,7 +68,7 @@ def _slab(o: float, d: float, half: float) -> Span:
     return (a, b) if a < b else (b, a)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _box(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, s: Float64) -> Span:
     ax, bx = _slab(ox - s[0], dx, s[3])
     ay, by = _slab(oy - s[1], dy, s[4])
@@ -75,7 +76,7 @@ def _box(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, s: Fl
     return max(ax, ay, az), min(bx, by, bz)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _quadric(a: float, b: float, c: float) -> Span:
     """Return both roots of a t^2 + 2 b t + c."""
     root = b * b - a * c
@@ -85,7 +86,7 @@ def _quadric(a: float, b: float, c: float) -> Span:
     return (-b - root) / a, (-b + root) / a
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _ellipsoid(
     ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, s: Float64, scale: float
 ) -> Span:
@@ -95,7 +96,7 @@ def _ellipsoid(
     return _quadric(u * u + v * v + w * w, x * u + y * v + z * w, x * x + y * y + z * z - 1.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _capsule(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, s: Float64) -> Span:
     bx, by, bz, r = s[3] - s[0], s[4] - s[1], s[5] - s[2], s[6]
     x, y, z = ox - s[0], oy - s[1], oz - s[2]
@@ -116,7 +117,7 @@ def _capsule(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, s
     return near, far
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _wheel(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, s: Float64) -> Span:
     x, z = ox - s[0], oz - s[2]
     a, b = _slab(oy - s[1], dy, s[4])
@@ -127,7 +128,7 @@ def _wheel(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, s: 
     return max(a, t0), min(b, t1)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _disc(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, s: Float64) -> Span:
     along_y = s[5] > 0.5
     o, d = (oy - s[1], dy) if along_y else (ox - s[0], dx)
@@ -142,7 +143,7 @@ def _disc(ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, s: F
     return math.inf, -math.inf
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _hull(
     ox: float,
     oy: float,
@@ -171,7 +172,7 @@ def _hull(
     return near, far
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def leaf_hit(
     ox: float,
     oy: float,
@@ -241,7 +242,7 @@ def leaf_hit(
     return math.inf, 0.0, 0.0, 1.0, 0.0
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def span(
     kind: int,
     ox: float,
@@ -285,7 +286,7 @@ def span(
     return math.inf, -math.inf
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def normal(kind: int, x: float, y: float, z: float, s: Float64, planes: Float64) -> Vector:
     """Return the outward unit normal, in the object's frame, at a point of a part's surface."""
     nx, ny, nz = 0.0, 0.0, 1.0

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from weather_aug._compiled import compiled, inlined
 from weather_aug.clip.street_ground import ground_paint, is_planted
 from weather_aug.clip.street_materials import paint
 from weather_aug.clip.street_path import Curve, Section, centre_slope, centre_y
@@ -60,7 +60,7 @@ class Surface(NamedTuple):
     """Share of sunlight that shines through, for leaves."""
 
 
-@numba.njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def _contact(world: World, x: float, y: float) -> float:
     """Return how much sky light the objects that stand nearby leave for the ground, 0..1."""
     cell = cell_of(world, x, y)
@@ -78,14 +78,14 @@ def _contact(world: World, x: float, y: float) -> float:
     return left
 
 
-@numba.njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def _footprint(size: float, cosine: float, along: float) -> float:
     """Return the length of a pixel on a surface along an axis that the ray follows by `along`."""
     slant = along / max(cosine, 0.03)
     return size * math.sqrt(1.0 + slant * slant)
 
 
-@numba.njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def ground_surface(
     world: World,
     setting: Setting,
@@ -134,7 +134,7 @@ def ground_surface(
     return Surface(label, n, n, albedo, 0.0, open_sky, 0.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _leaf_shade(
     tile: Float32, look: Float64, q: Vector, outward: Vector, tint: float, core: bool, f: float
 ) -> tuple[Colour, float]:
@@ -151,7 +151,7 @@ def _leaf_shade(
     return albedo, open_sky
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def part_surface(
     world: World,
     looks: Looks,

@@ -9,10 +9,10 @@ from __future__ import annotations
 import functools
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from weather_aug._compiled import compiled
 from weather_aug._keys import key_of, uniforms
 
 Float32 = NDArray[np.float32]
@@ -58,7 +58,7 @@ def _stretched(lattice: NDArray[np.float64], factor: int) -> NDArray[np.float64]
     return lattice
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _bilinear(tile: Float32, level: int, u: float, v: float) -> float:
     size = 512 >> level
     # Levels lie behind each other: the sum of 4**9 + 4**8 + ... down to this level.
@@ -74,7 +74,7 @@ def _bilinear(tile: Float32, level: int, u: float, v: float) -> float:
     return float(top + (low - top) * ay)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def noise(tile: Float32, u_m: float, v_m: float, period_m: float, footprint_m: float) -> float:
     """Return the tile's value at a point, filtered to a footprint; about -1..1.
 
@@ -94,7 +94,7 @@ def noise(tile: Float32, u_m: float, v_m: float, period_m: float, footprint_m: f
     return a + (b - a) * (level - fine)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def grain(tile: Float32, u_m: float, v_m: float, period_m: float, footprint_m: float) -> float:
     """Return `noise` without its blobs larger than a 32nd of the period; about -1..1.
 
@@ -109,14 +109,14 @@ def grain(tile: Float32, u_m: float, v_m: float, period_m: float, footprint_m: f
     return 2.6 * (a + (b - a) * (level - fine) - _bilinear(tile, 4, u, v))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def band(x: float, low: float, high: float, footprint: float) -> float:
     """Return the share of the footprint around x that lies in [low, high]."""
     f = max(footprint, 1e-4)
     return min(max((min(high, x + 0.5 * f) - max(low, x - 0.5 * f)) / f, 0.0), 1.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def stripe(x: float, period: float, low: float, high: float, footprint: float) -> float:
     """Return `band` for a pattern that repeats; a footprint beyond the period sees the mean."""
     f = min(max(footprint, 1e-4), period)
@@ -125,7 +125,7 @@ def stripe(x: float, period: float, low: float, high: float, footprint: float) -
     return min(share, 1.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def mixed(a: Colour, b: Colour, share: float) -> Colour:
     """Return a at share 0, b at share 1."""
     return (
@@ -135,13 +135,13 @@ def mixed(a: Colour, b: Colour, share: float) -> Colour:
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def times(a: Colour, factor: float) -> Colour:
     """Return a colour made brighter or darker."""
     return a[0] * factor, a[1] * factor, a[2] * factor
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def smooth(low: float, high: float, x: float) -> float:
     """Return 0 below `low`, 1 above `high`, a smooth step between."""
     t = min(max((x - low) / (high - low), 0.0), 1.0)

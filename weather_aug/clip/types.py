@@ -223,7 +223,7 @@ def _check_intrinsics(intrinsics: Float64) -> None:
     pinhole = np.array([[fx, 0, intrinsics[0, 2]], [0, fy, intrinsics[1, 2]], [0, 0, 1]])
     if not np.allclose(intrinsics, pinhole, rtol=0, atol=1e-6 * max(fx, fy)):
         raise CalibrationError(
-            "intrinsics must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; rectify a skewed camera first"
+            "intrinsics must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; rectify the camera first"
         )
 
 

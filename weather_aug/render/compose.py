@@ -19,9 +19,12 @@ from weather_aug.errors import ArgumentError
 from weather_aug.particles import statistics
 from weather_aug.particles.field import MAX_PARTICLES, ParticleField, Window
 from weather_aug.particles.resolve import DEPTH_BINS, FAR_M, Resolved
-from weather_aug.render import kernels
+from weather_aug.render import planes
 from weather_aug.render.label import NEIGHBOURHOOD_PX, least_linear_contrast, readable_labels
 from weather_aug.render.light import Ambience, rain_colour, snow_colour
+from weather_aug.render.medium import Medium, Optics
+from weather_aug.render.project import BAND_ROWS, order_by_band, project
+from weather_aug.render.shade import Tone, shade
 from weather_aug.taxonomy import SKY
 from weather_aug.weather import Weather
 
@@ -158,7 +161,7 @@ def _cut(frame: Frame, window: Window) -> tuple[UInt8, UInt8 | None, Float32]:
     depth = _clean_depth(np.asarray(frame.depth_m[part]))
     label = None if frame.label is None else np.ascontiguousarray(frame.label[part])
     if label is not None:
-        kernels.raise_sky(label.reshape(-1), np.uint8(SKY), depth.reshape(-1))
+        planes.raise_sky(label.reshape(-1), np.uint8(SKY), depth.reshape(-1))
     return np.ascontiguousarray(frame.image[part]), label, depth
 
 
@@ -167,10 +170,10 @@ def _clean_depth(depth: NDArray[Any]) -> Float32:
     if depth.dtype == np.float16:
         wide = np.empty(depth.shape, np.float32)
         bits = np.ascontiguousarray(depth).view(np.uint16)
-        kernels.widen_depth(bits.reshape(-1), wide.view(np.int32).reshape(-1))
+        planes.widen_depth(bits.reshape(-1), wide.view(np.int32).reshape(-1))
         return wide
     copy = np.array(depth, np.float32, order="C")
-    kernels.clean_depth(copy.reshape(-1))
+    planes.clean_depth(copy.reshape(-1))
     return copy
 
 
@@ -205,7 +208,7 @@ def _fields(weather: Weather, seed: int, ambience: Ambience) -> list[ParticleFie
     return [ParticleField(population, seed, wind, axes) for population in populations]
 
 
-def _optics(camera: Camera, up_world: Float64) -> kernels.Optics:
+def _optics(camera: Camera, up_world: Float64) -> Optics:
     up = camera.world_from_camera[:3, :3].T @ up_world
     values = (
         *camera.focal_px,
@@ -216,10 +219,10 @@ def _optics(camera: Camera, up_world: Float64) -> kernels.Optics:
         *up,
         camera.width * camera.height,
     )
-    return kernels.Optics(*(np.float32(v) for v in values))
+    return Optics(*(np.float32(v) for v in values))
 
 
-def _medium(weather: Weather, fields: list[ParticleField]) -> kernels.Medium:
+def _medium(weather: Weather, fields: list[ParticleField]) -> Medium:
     values = (
         weather.fog_per_m,
         1.0 / weather.fog_scale_height_m,
@@ -227,7 +230,7 @@ def _medium(weather: Weather, fields: list[ParticleField]) -> kernels.Medium:
         sum(field.population.extinction_per_m for field in fields),
         FAR_M / DEPTH_BINS,
     )
-    return kernels.Medium(*(np.float32(v) for v in values))
+    return Medium(*(np.float32(v) for v in values))
 
 
 def _shade(
@@ -250,16 +253,16 @@ def _shade(
     airlight = ambience.airlight.astype(np.float32)
     splats = _splats(frame, weather, ambience, window, fields, resolved, optics, medium, carried)
     _, _, height, width = window
-    bands = -(-height // kernels.BAND_ROWS)
-    order, band_starts = kernels.order_by_band(splats, window, bands)
+    bands = -(-height // BAND_ROWS)
+    order, band_starts = order_by_band(splats, window, bands)
     curve, matrix = tone(weather.overcast)
-    planes: dict[str, Any] = {
+    out: dict[str, Any] = {
         "image": np.empty((3, height, width), np.uint8),
         "transmittance": np.empty((height, width), np.float32),
         "distinct": np.empty((height, width), np.uint8),
         "covered": np.zeros((height, width), np.uint8),
     }
-    kernels.compose(
+    shade(
         image,
         depth,
         sky,
@@ -269,7 +272,7 @@ def _shade(
         carried,
         curve.astype(np.float32),
         matrix.astype(np.float32),
-        kernels.Tone(
+        Tone(
             np.float32(weather.overcast),
             np.float32(max(float(ambience.sky @ LUMINANCE), 0.05)),
             np.float32(ZENITH_GAIN),
@@ -280,10 +283,10 @@ def _shade(
         band_starts,
         _falloff(),
         np.float32(least_linear_contrast(ambience.airlight)),
-        *planes.values(),
+        *out.values(),
     )
-    planes["image"] = cv2.merge(tuple(planes["image"]))
-    return planes
+    out["image"] = cv2.merge(tuple(out["image"]))
+    return out
 
 
 def _splats(
@@ -293,8 +296,8 @@ def _splats(
     window: Window,
     fields: list[ParticleField],
     resolved: list[Resolved],
-    optics: kernels.Optics,
-    medium: kernels.Medium,
+    optics: Optics,
+    medium: Medium,
     carried: Float32,
 ) -> Float32:
     """(N, 12) screen-space particles of all fields that touch the window."""
@@ -306,9 +309,7 @@ def _splats(
         particles = field.particles(frame.camera, frame.time_s, part, window)
         splats = np.empty((len(particles), 12), np.float32)
         colour = colours[field.population.kind](light).astype(np.float32)
-        count = kernels.project(
-            particles, optics, medium, carried, colour, airlight, window, splats
-        )
+        count = project(particles, optics, medium, carried, colour, airlight, window, splats)
         found.append(splats[:count])
     return np.concatenate(found) if found else np.empty((0, 12), np.float32)
 

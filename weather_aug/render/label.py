@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug.colour import LUMINANCE
-from weather_aug.render import kernels
+from weather_aug.render.planes import read_labels
 from weather_aug.taxonomy import IGNORE, SKY
 
 Float32 = NDArray[np.float32]
@@ -48,9 +48,9 @@ def readable_labels(
         near_distinct = cv2.dilate(surfaces, np.ones(size, np.uint8))
     out, invalid = np.empty_like(label), np.empty_like(label)
     limits = (HAZY_TRANSMITTANCE, DOUBTFUL_TRANSMITTANCE, LEAST_TRANSMITTANCE)
-    planes = (label, transmittance, near_distinct, covered)
-    kernels.read_labels(
-        *(plane.reshape(-1) for plane in planes),
+    inputs = (label, transmittance, near_distinct, covered)
+    read_labels(
+        *(plane.reshape(-1) for plane in inputs),
         tuple(np.float32(limit) for limit in limits),
         np.uint8(IGNORE),
         np.uint8(SKY),

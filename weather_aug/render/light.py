@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from weather_aug.clip.types import Frame
 from weather_aug.colour import LUMINANCE, SRGB_LEVELS_LINEAR, linear_from_srgb
 from weather_aug.edit.physical.overcast import MEAN_SKY_GAIN, tone
-from weather_aug.render.kernels import FAR_DEPTH_M
+from weather_aug.render.medium import FAR_DEPTH_M
 from weather_aug.taxonomy import GROUND, SKY
 
 Float32 = NDArray[np.float32]

@@ -1,0 +1,193 @@
+"""Tone, fog and particles over a picture, band by band, in linear light. Compiled.
+
+Serial and without fast-math, so that the same arguments give the same bits in every process.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from weather_aug._compiled import compiled
+from weather_aug.render.medium import transmittance_row
+from weather_aug.render.project import BAND_ROWS
+from weather_aug.render.splat import blend_splat
+
+
+class Tone(NamedTuple):
+    """How the weather's light changes the recorded colours, float32."""
+
+    overcast: np.float32
+    sky_luminance: np.float32
+    zenith_gain: np.float32
+
+
+@compiled
+def shade(
+    image,
+    depth,
+    sky,
+    window,
+    optics,
+    medium,
+    resolved_depth,
+    linear,
+    matrix,
+    tone,
+    airlight,
+    splats,
+    order,
+    band_starts,
+    falloff,
+    least_contrast,
+    out,
+    through,
+    distinct,
+    covered,
+):
+    """Render the window: tone, fog and particles in linear light, band by band.
+
+    Args:
+        image: (H, W, 3) uint8 of the window.
+        depth: (H, W) float32 z-depth of the window, `inf` for far.
+        sky: (H, W) bool of the window.
+        window: (top, left, height, width) in the whole picture.
+        optics: Camera of the whole picture.
+        medium: Air.
+        resolved_depth: Optical depth of resolved particles by depth.
+        linear: (256,) float32 toned linear light by sRGB level.
+        matrix: (3, 3) float32 colour matrix after it.
+        tone: Sky.
+        airlight: (3,) float32.
+        splats: (N, 12) float32.
+        order: Splat indices by band.
+        band_starts: (bands + 1,).
+        falloff: exp(-x / 2) for x in [0, 12.5), float32.
+        least_contrast: Linear difference from the airlight that can just be seen.
+        out: (3, H, W) uint8 out.
+        through: (H, W) float32 out: transmittance of air and particles.
+        distinct: (H, W) uint8 out: 1 where what is left of the surface's difference from the
+            airlight can be seen.
+        covered: (H, W) uint8, zero: set where a large particle hides the surface.
+    """
+    top, left, height, width = window
+    ray_x = np.empty(width, np.float32)
+    for x in range(width):
+        ray_x[x] = (np.float32(x + left) - optics.cx) / optics.fx
+    # Red, green, blue, transmittance and depth of a band's rows side by side. The odd stride keeps
+    # them apart in the cache: planes of equal page offset would evict each other at every pixel.
+    stride = (width + 15) // 16 * 16 + 80
+    planes = np.empty((BAND_ROWS, 5, stride), np.float32)
+    gap = np.empty((BAND_ROWS, width), np.float32)
+    tau = np.empty(width, np.float32)
+    slant = np.empty(width, np.float32)
+    overcast = tone.overcast > np.float32(0.0)
+    for band in range(band_starts.shape[0] - 1):
+        y0 = band * BAND_ROWS
+        y1 = min(y0 + BAND_ROWS, height)
+        for y in range(y0, y1):
+            k = y - y0
+            ray_y = (np.float32(y + top) - optics.cy) / optics.fy
+            red, green, blue = planes[k, 0, :width], planes[k, 1, :width], planes[k, 2, :width]
+            clear = planes[k, 3, :width]
+            planes[k, 4, :width] = depth[y]
+            transmittance_row(
+                depth[y], ray_x, ray_y, optics, medium, resolved_depth, tau, slant, clear
+            )
+            _decode_row(image[y], linear, red, green, blue)
+            if overcast:
+                _overcast_row(
+                    sky[y], ray_x, ray_y, optics, matrix, tone, airlight, red, green, blue
+                )
+            _fog_row(clear, airlight, red, green, blue, gap[k])
+        for k in range(band_starts[band], band_starts[band + 1]):
+            blend_splat(splats[order[k]], (y0, y1), window, falloff, planes, covered)
+        for y in range(y0, y1):
+            k = y - y0
+            for channel in range(3):
+                encode_row(planes[k, channel, :width])
+                _quantise_row(planes[k, channel, :width], out[channel, y])
+            through[y] = planes[k, 3, :width]
+            _distinct_row(gap[k], through[y], least_contrast, distinct[y])
+
+
+@compiled
+def _decode_row(image, linear, red, green, blue):
+    for x in range(image.shape[0]):
+        red[x] = linear[image[x, 0]]
+        green[x] = linear[image[x, 1]]
+        blue[x] = linear[image[x, 2]]
+
+
+@compiled
+def _overcast_row(sky, ray_x, ray_y, optics, matrix, tone, airlight, red, green, blue):
+    """Change the colours of one row, and its sky towards an overcast one."""
+    zero, one = np.float32(0.0), np.float32(1.0)
+    a0, a1, a2 = airlight[0], airlight[1], airlight[2]
+    across = one + ray_y * ray_y
+    rise_y = optics.up_y * ray_y + optics.up_z
+    brightest = np.float32(3.0) / tone.sky_luminance
+    for x in range(sky.shape[0]):
+        r, g, b = red[x], green[x], blue[x]
+        y = np.float32(0.2126) * r + np.float32(0.7152) * g + np.float32(0.0722) * b
+        # Leaves and wires inside the sky's label are dark: they stay what they are.
+        matte = y * brightest - np.float32(0.9)
+        matte = matte if matte > zero else zero
+        matte = matte if matte < one else one
+        weight = tone.overcast * matte if sky[x] else zero
+        sine = (optics.up_x * ray_x[x] + rise_y) / np.sqrt(across + ray_x[x] * ray_x[x])
+        brighter = one + tone.zenith_gain * (sine if sine > zero else zero)
+        r_new = matrix[0, 0] * r + matrix[0, 1] * g + matrix[0, 2] * b
+        g_new = matrix[1, 0] * r + matrix[1, 1] * g + matrix[1, 2] * b
+        b_new = matrix[2, 0] * r + matrix[2, 1] * g + matrix[2, 2] * b
+        red[x] = r_new + weight * (a0 * brighter - r_new)
+        green[x] = g_new + weight * (a1 * brighter - g_new)
+        blue[x] = b_new + weight * (a2 * brighter - b_new)
+
+
+@compiled
+def _fog_row(through, airlight, red, green, blue, gap):
+    """Veil one row, and say how far (linear light) its surfaces are from the airlight."""
+    a0, a1, a2 = airlight[0], airlight[1], airlight[2]
+    for x in range(through.shape[0]):
+        t = through[x]
+        dr, dg, db = red[x] - a0, green[x] - a1, blue[x] - a2
+        red[x], green[x], blue[x] = a0 + t * dr, a1 + t * dg, a2 + t * db
+        dr, dg, db = abs(dr), abs(dg), abs(db)
+        most = dr if dr > dg else dg
+        gap[x] = most if most > db else db
+
+
+@compiled
+def encode_row(light):
+    """Turn linear light into sRGB levels plus one half, in place, to 0.1 of a level.
+
+    A polynomial in the square root on the power branch (largest error 0.083 levels), the exact
+    line below it; every 8-bit level survives decoding and encoding.
+    """
+    zero, one = np.float32(0.0), np.float32(1.0)
+    for x in range(light.shape[0]):
+        v = light[x]
+        v = v if v > zero else zero
+        v = v if v < one else one
+        s = np.sqrt(v)
+        p = np.float32(-1.6236571) + s * np.float32(0.5173023)
+        p = np.float32(2.0315735) + s * p
+        p = np.float32(-1.4027363) + s * p
+        p = np.float32(1.5179509) + s * p
+        p = np.float32(-0.0401096) + s * p
+        p = p if v > np.float32(0.0031308) else np.float32(12.92) * v
+        light[x] = p * np.float32(255.0) + np.float32(0.5)
+
+
+@compiled
+def _quantise_row(levels, out):
+    for x in range(levels.shape[0]):
+        out[x] = np.uint8(np.int32(levels[x]))
+
+
+@compiled
+def _distinct_row(gap, through, least_contrast, out):
+    for x in range(gap.shape[0]):
+        out[x] = np.uint8(1) if gap[x] * through[x] >= least_contrast else np.uint8(0)

@@ -64,6 +64,18 @@ def test_wind_blows_from_any_side_with_the_weathers_strength(draws: list[Weather
     assert math.hypot(*draw.weather.wind_m_per_s) == pytest.approx(expected)
 
 
+def test_one_draws_numbers_do_not_know_of_each_other(draws: list[WeatherDraw]) -> None:
+    """Whether it falls and where the wind comes from say nothing of the severity."""
+    snow = [draw for draw in draws if draw.kind == "snow"]
+    severity = np.array([draw.severity for draw in snow])
+    falls = np.array([draw.weather.snow_mm_per_h > 0 for draw in snow])
+    assert stats.ks_2samp(severity[falls], severity[~falls]).pvalue >= LEAST_P
+    winds = np.array([draw.weather.wind_m_per_s for draw in snow])
+    angles = np.arctan2(winds[:, 1], winds[:, 0]) % (2 * math.pi)
+    assert abs(np.corrcoef(severity, angles)[0, 1]) <= 4 / math.sqrt(len(snow))
+    assert stats.ks_2samp(angles[falls], angles[~falls]).pvalue >= LEAST_P
+
+
 def test_particle_seeds_differ(draws: list[WeatherDraw]) -> None:
     assert len({draw.seed for draw in draws}) == ITEMS
 

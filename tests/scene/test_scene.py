@@ -19,6 +19,7 @@ from weather_aug._files import sha256_of
 from weather_aug.clip.types import FrameKey
 from weather_aug.errors import ArgumentError, SceneError
 from weather_aug.render.compose import RenderedFrame, RenderOptions, render
+from weather_aug.render.light import ambience_of
 from weather_aug.scene import store
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.taxonomy import IGNORE, SKY
@@ -57,6 +58,12 @@ def assert_same(expected: RenderedFrame, actual: RenderedFrame) -> None:
 def windows(draw: st.DrawFn) -> tuple[int, int, int, int]:
     top, left = draw(st.integers(0, HEIGHT - 1)), draw(st.integers(0, WIDTH - 1))
     return top, left, draw(st.integers(1, HEIGHT - top)), draw(st.integers(1, WIDTH - left))
+
+
+@pytest.fixture(scope="module")
+def wide_scene(tmp_path_factory: pytest.TempPathFactory) -> WeatherScene:
+    clip = TinyClip(frames=1, cameras=("front",), width=320, height=256)
+    return WeatherScene.build(clip, tmp_path_factory.mktemp("wide") / "scene")
 
 
 # Opening
@@ -124,6 +131,19 @@ def test_clear_weather_gives_the_recorded_bytes(tiny_scene: WeatherScene, index:
     assert (shot.depth == clean.depth_m.astype(np.float16)).all()
 
 
+def test_the_light_is_the_frames_own_and_the_airlight_the_clips(tiny_scene: WeatherScene) -> None:
+    airlight = tiny_scene.manifest.airlight.tolist()
+    for key in tiny_scene.keys:
+        expected = ambience_of(TinyClip().frame(key), np.eye(3))
+        ambience = tiny_scene.ambience(key)
+        for name in ("sky", "middle", "ground"):
+            assert getattr(ambience, name).tolist() == getattr(expected, name).tolist()
+        assert ambience.airlight.tolist() == airlight
+        frame, weather = tiny_scene.frame(key), WEATHERS["all"]
+        by_hand = render(frame, weather, seed=1, ambience=ambience)
+        assert_same(by_hand, tiny_scene.render(key, weather, seed=1))
+
+
 @pytest.mark.parametrize("name", [name for name in WEATHERS if name != "clear"])
 def test_weather_changes_the_picture(tiny_scene: WeatherScene, name: str) -> None:
     key = tiny_scene.keys[0]
@@ -152,6 +172,20 @@ def test_a_window_is_that_part_of_the_whole(
     }
     cut = RenderedFrame(**{"label": None, "label_full": None, **part})
     assert_same(cut, scene.render(key, WEATHERS[name], seed=2, window=window))
+
+
+@pytest.mark.parametrize("name", ["all", "extreme rain"])
+def test_tiles_join_to_the_whole(wide_scene: WeatherScene, name: str) -> None:
+    """At a resolution at which particles, streaks and blur lie across every edge."""
+    key = wide_scene.keys[0]
+    whole = planes(wide_scene.render(key, WEATHERS[name], seed=1))
+    height, width = wide_scene.size_of(key)
+    for top in range(0, height, 32):
+        for left in range(0, width, 32):
+            shot = wide_scene.render(key, WEATHERS[name], seed=1, window=(top, left, 32, 32))
+            for plane, tile in planes(shot).items():
+                part = whole[plane][top : top + 32, left : left + 32]
+                assert np.array_equal(part, tile), (plane, top, left)
 
 
 @pytest.mark.parametrize(

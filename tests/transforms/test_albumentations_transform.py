@@ -59,6 +59,7 @@ def test_the_mask_says_what_can_be_seen(sample: Sample) -> None:
     assert hidden.any()
     assert (done["mask"][hidden] == IGNORE).all()
     assert (sample["depth"][hidden] > 60).all()
+    assert done["depth"].tobytes() == sample["depth"].tobytes()
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int16, np.int32, np.int64])

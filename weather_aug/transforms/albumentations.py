@@ -103,7 +103,7 @@ class RandomWeather(A.DualTransform):
         """The mask with 255 where the weather hides the surface; depth passes through."""
         if mask.dtype.kind == "f" or shot.label is None:
             return mask
-        return np.where(shot.label != shot.label_full, np.asarray(IGNORE, mask.dtype), mask)
+        return np.where(shot.label != shot.label_full, IGNORE, mask)
 
     def _render(self, params: dict[str, Any], data: dict[str, Any]) -> RenderedFrame:
         image = image_uint8("image", data["image"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import time
@@ -14,6 +15,7 @@ from tyro.conf import Positional
 
 from weather_aug import _files
 from weather_aug.errors import ArgumentError, DataError, IntegrityError, WeatherAugError, printable
+from weather_aug.taxonomy import IGNORE
 
 
 @dataclass(frozen=True)
@@ -195,30 +197,31 @@ class Demo:
 
     out: Path = Path("out/demo")
     """Folder of the scene and the sheet."""
-    frames: int = 24
+    frames: int = 6
     """Time steps of the street, at 10 Hz."""
+    width: int = 960
+    """Width of its pictures, pixels; the height is nine sixteenths of it."""
 
     def run(self) -> None:
-        """Build the street unless it stands there, draw samples, and make the sheet."""
+        """Build the street, draw samples, and make the sheet."""
         from weather_aug.clip.open import open_clip
         from weather_aug.scene.scene import WeatherScene
         from weather_aug.transforms.dataset import WeatherDataset
         from weather_aug.view.sheet import contact_sheet, write_png
 
         start = time.perf_counter()
-        scene_folder = self.out / "scene"
-        if not scene_folder.exists():
-            _say("1/3 build a scene of the procedural street (three cameras)")
-            with _files.reported(self.out):
-                self.out.mkdir(parents=True, exist_ok=True)
-            clip = open_clip(f"street:?frames={self.frames}")
-            WeatherScene.build(clip, scene_folder, progress=_to_people())
-        scene = WeatherScene.load(scene_folder)
+        _say("1/3 build a scene of the procedural street, three cameras (the first run compiles)")
+        with _files.reported(self.out):
+            self.out.mkdir(parents=True, exist_ok=True)
+        height = self.width * 9 // 16
+        clip = open_clip(f"street:?frames={self.frames}&width={self.width}&height={height}")
+        scene = WeatherScene.build(clip, self.out / "scene", progress=_to_people(), overwrite=True)
         _say("2/3 draw weather on the fly, as a training loop does")
         dataset = WeatherDataset([scene], seed=1)
         for index in range(0, len(dataset), max(1, len(dataset) // 3)):
             sample = dataset[index]
-            _say(f"    image {tuple(sample['image'].shape)}, {sample['recipe'][:120]}…")
+            ignored = (sample["label"] == IGNORE).float().mean()
+            _say(f"    {_state(sample['recipe'])}; {ignored:.1%} of the label ignored")
         _say("3/3 render rain, snow and fog at three severities")
         middle = scene.keys[len(scene.keys) // 2].time_index
         keys = [key for key in scene.keys if key.time_index == middle]
@@ -284,6 +287,16 @@ def _inspect_scene(path: Path) -> list[str]:
     _say(f"{len(scene.keys)} frames ({labelled} labelled) of {', '.join(scene.cameras)}")
     _say(f"{len(manifest.files)} files, {size_mib:.1f} MiB")
     return scene.damaged_files()
+
+
+def _state(recipe: str) -> str:
+    """One line of a sample's recipe for people: the frame, and what is not zero in its weather."""
+    sample = json.loads(recipe)
+    weather = sample["weather"].items()
+    state = ", ".join(
+        f"{name} {value:.3g}" for name, value in weather if isinstance(value, float) and value
+    )
+    return f"{sample['camera']} {sample['time_index']}: {state or 'clear'}"
 
 
 def _severity(text: str) -> float | str:

@@ -65,7 +65,7 @@ def contact_sheet(
     *,
     severities: Sequence[str | float] = SEVERITIES[:3],
     seed: int = 0,
-    tile_width: int = 320,
+    tile_width: int = 480,
 ) -> UInt8:
     """Every weather and severity of some frames, with label and transmittance below each picture.
 

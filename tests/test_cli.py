@@ -274,7 +274,9 @@ def test_the_demo_ends_with_a_sheet(tmp_path: Path, capsys: pytest.CaptureFixtur
     main(["demo", "--out", str(out), "--frames", "1"])
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1] == str(out / "contact_sheet.png")
-    assert cv2.imread(lines[-1]).shape[1] == 26 + 10 * (320 + 4)
+    sheet = cv2.imread(lines[-1])
+    assert sheet.shape[1] > 1000
+    assert len(np.unique(sheet.reshape(-1, 3), axis=0)) > 1000, "pictures, not paper"
     assert WeatherScene.load(out / "scene", verify=True).cameras == ("left", "front", "right")
     main(["demo", "--out", str(out), "--frames", "1"])
     assert "1/3 build" not in capsys.readouterr().out

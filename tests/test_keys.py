@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy import stats
 
-from weather_aug._keys import check_seed, key_of, key_of_text, uniforms
+from weather_aug._keys import check_seed, key_of, uniforms
 from weather_aug.errors import ArgumentError
 
 SEEDS = [0, -1, 1, 2**31, 2**32, 2**63, 2**64 - 1, -(2**63)]
@@ -31,14 +31,11 @@ def test_fields_do_not_run_into_each_other() -> None:
     lists = [(), (0,), (0, 0), (1,), (1, 0), (0, 1), (256,), (0, 256), (1, 1), (257,)]
     assert len({key_of("test", *fields) for fields in lists}) == len(lists)
     assert key_of("test", 1) != key_of("other", 1)
-    assert key_of_text("test", "ab") != key_of_text("test", "ba")
-    assert key_of_text("test", "ab") != key_of_text("other", "ab")
 
 
 def test_keys_are_these_in_every_process() -> None:
     """Data sets are drawn again from their seeds for years: the keys are part of the format."""
     assert key_of("test", 1, -2, 3) == 0xF38FFEB84EB67670A062146C588B0B4D
-    assert key_of_text("test", "street") == 0x9D01337B7EDA1016
     assert uniforms(7, 3).tolist() == [0.8720734548204873, 0.29536538151378355, 0.4200976785072422]
 
 

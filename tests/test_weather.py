@@ -389,3 +389,11 @@ def test_a_blend_outside_its_ends_is_refused(t: Any) -> None:
 def test_text_that_is_no_weather_is_refused(text: str) -> None:
     with pytest.raises(ArgumentError):
         Weather.from_json(text)
+
+
+def test_fog_that_comes_keeps_its_height() -> None:
+    """Half-way from clear air the layer is thinner, not twice as high."""
+    fog = Weather.fog(1.0)
+    half = Weather.blend(Weather.clear(), fog, 0.5)
+    assert half.fog_scale_height_m == pytest.approx(fog.fog_scale_height_m)
+    assert half.fog_per_m == pytest.approx(0.5 * fog.fog_per_m)

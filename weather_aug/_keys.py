@@ -27,17 +27,12 @@ def key_of(domain: str, *fields: int) -> int:
     Raises:
         ArgumentError: If a field is not an integer in [-2**63, 2**64).
     """
-    digest = hashlib.blake2b(digest_size=16, person=domain.encode()[:16])
+    # A domain longer than 16 bytes is refused by the hash; it must not lose its end.
+    digest = hashlib.blake2b(digest_size=16, person=domain.encode())
     digest.update(len(fields).to_bytes(8, "little"))
     for field in fields:
         value = check_seed("field", field)
         digest.update(value.to_bytes(16, "little", signed=True))
-    return int.from_bytes(digest.digest(), "little")
-
-
-def key_of_text(domain: str, text: str) -> int:
-    """Hash a text into a 64-bit field for `key_of` (a scene digest, a file name)."""
-    digest = hashlib.blake2b(text.encode(), digest_size=8, person=domain.encode()[:16])
     return int.from_bytes(digest.digest(), "little")
 
 

@@ -52,9 +52,9 @@ class Weather:
     mist_per_km: float = 0.0
     """Extinction of what comes with precipitation (mist, blowing snow), in [0, 100] per km."""
     wetness: float = 0.0
-    """Of the ground, in [0, 1]."""
+    """Of the ground, in [0, 1]. Part of the state and of labels' recipes; not drawn yet."""
     snow_cover: float = 0.0
-    """Of the ground beside the road, in [0, 1]."""
+    """Of the ground beside the road, in [0, 1]; not drawn yet."""
     overcast: float = 0.0
     """From the recorded sky (0) to a closed cloud deck (1)."""
     wind_m_per_s: Wind = (0.0, 0.0, 0.0)
@@ -167,23 +167,13 @@ class Weather:
         t = finite("t", t, 0, 1)
         if t in (0.0, 1.0):
             return b if t else a
-        return _combine(a, b, lambda x, y: x + (y - x) * t)
+        return _combine(a, b, 1.0 - t, t)
 
     @staticmethod
     def mix(a: Weather, b: Weather) -> Weather:
-        """Both at once: rates and extinctions add, the ground takes both, the stronger wind blows.
-
-        Fog of different heights becomes one layer whose inverse scale height is the mean of the
-        two, weighted by their extinctions.
-        """
-        both = _combine(a, b, lambda x, y: x + y)
-        beta_a, beta_b = a.fog_per_m, b.fog_per_m
-        inverse = (beta_a / a.fog_scale_height_m + beta_b / b.fog_scale_height_m) / (
-            beta_a + beta_b or 1.0
-        )
+        """Both at once: rates and extinctions add, the stronger wind blows."""
         return replace(
-            both,
-            fog_scale_height_m=1.0 / inverse if inverse else math.inf,
+            _combine(a, b, 1.0, 1.0),
             wetness=1 - (1 - a.wetness) * (1 - b.wetness),
             snow_cover=1 - (1 - a.snow_cover) * (1 - b.snow_cover),
             overcast=max(a.overcast, b.overcast),
@@ -353,17 +343,31 @@ def _build(cls: type[Weather], state: dict[str, Any], overrides: dict[str, Any])
     return cls(**(state | overrides))
 
 
-def _combine(a: Weather, b: Weather, op: Any) -> Weather:
-    """Combine field by field; ranges and heights through their inverses, which are additive."""
-    state: dict[str, Any] = {}
-    for name, (low, high) in _RANGES.items():
-        x, y = getattr(a, name), getattr(b, name)
-        if high == math.inf:
-            inverse = op(1 / x, 1 / y)
-            state[name] = max(1 / inverse, low) if inverse else math.inf
-        else:
-            state[name] = min(max(op(x, y), low), high)
+def _combine(a: Weather, b: Weather, share_a: float, share_b: float) -> Weather:
+    """Add the two states field by field, each times its share; fog adds as extinction.
+
+    Fog of different heights becomes one layer whose inverse scale height is the mean of the two,
+    weighted by their extinctions.
+    """
+    state: dict[str, Any] = {
+        name: min(max(share_a * getattr(a, name) + share_b * getattr(b, name), low), high)
+        for name, (low, high) in _RANGES.items()
+        if high < math.inf
+    }
     state["wind_m_per_s"] = tuple(
-        min(max(op(x, y), -60.0), 60.0) for x, y in zip(a.wind_m_per_s, b.wind_m_per_s, strict=True)
+        min(max(share_a * x + share_b * y, -60.0), 60.0)
+        for x, y in zip(a.wind_m_per_s, b.wind_m_per_s, strict=True)
     )
+    # Without any fog heights weigh alike; they say something only once fog is added.
+    fog_a = share_a / a.visibility_m
+    fog_b = share_b / b.visibility_m
+    inverse = fog_a + fog_b
+    thinning = (
+        (fog_a / a.fog_scale_height_m + fog_b / b.fog_scale_height_m) / inverse
+        if inverse
+        else (share_a / a.fog_scale_height_m + share_b / b.fog_scale_height_m) / (share_a + share_b)
+    )
+    state["visibility_m"] = max(1 / inverse, _RANGES["visibility_m"][0]) if inverse else math.inf
+    lowest = _RANGES["fog_scale_height_m"][0]
+    state["fog_scale_height_m"] = max(1 / thinning, lowest) if thinning else math.inf
     return Weather(**state)

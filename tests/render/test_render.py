@@ -153,6 +153,14 @@ def test_refusals():
         render(frame, Weather.fog(0.5), seed=2**64, ambience=AMBIENCE)
     with pytest.raises(ArgumentError, match="max_particles"):
         RenderOptions(10**9)
+    with pytest.raises(ArgumentError, match="whole"):
+        RenderOptions(1.5)
+    with pytest.raises(ArgumentError, match="four integers"):
+        checked_window((0, 0, 5), 61, 97)
+    with pytest.raises(ArgumentError, match="four integers"):
+        checked_window((0, 0, 5.5, 5), 61, 97)
+    with pytest.raises(ArgumentError, match="must be a Weather"):
+        render(frame, "rain", seed=0, ambience=AMBIENCE)
 
 
 def test_airlight_is_nearly_grey_and_neither_night_nor_burnt_out():

@@ -43,7 +43,10 @@ class RenderOptions:
     """Expected number of resolved particles in a whole picture; the rest becomes extinction."""
 
     def __post_init__(self) -> None:
-        finite("max_particles", self.max_particles, 0, MAX_PARTICLES // 2)
+        count = finite("max_particles", self.max_particles, 0, MAX_PARTICLES // 2)
+        if count != int(count):
+            raise ArgumentError(f"max_particles must be whole, got {self.max_particles!r}")
+        object.__setattr__(self, "max_particles", int(count))
 
 
 DEFAULT_OPTIONS = RenderOptions()
@@ -95,6 +98,8 @@ def render(
         seen through the air in front of them, all in linear light.
     """
     seed = check_seed("seed", seed)
+    if not isinstance(weather, Weather):
+        raise ArgumentError(f"weather must be a Weather, got {type(weather).__name__}")
     if frame.depth_m is None:
         raise ArgumentError(
             f"frame {frame.key} has no depth; build a scene from the clip, or pass depth_m"
@@ -116,7 +121,12 @@ def checked_window(window: Window | None, height: int, width: int) -> Window:
     """`window` as integers, or the whole picture; refuse one that leaves the picture."""
     if window is None:
         return (0, 0, height, width)
-    top, left, rows, columns = (int(v) for v in window)
+    try:
+        top, left, rows, columns = (v.__index__() for v in window)
+    except (AttributeError, TypeError, ValueError):
+        raise ArgumentError(
+            f"window must be four integers (top, left, height, width), got {window!r}"
+        ) from None
     if not (0 <= top and 0 <= left and rows > 0 and columns > 0):
         raise ArgumentError(f"window {window} must be (top >= 0, left >= 0, height > 0, width > 0)")
     if top + rows > height or left + columns > width:

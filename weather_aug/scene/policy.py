@@ -37,7 +37,8 @@ class WeatherPolicy:
         A draw is a pure function of (seed, epoch, item): no worker, order or earlier draw changes
         it. Types are weighted; a name with "+" (such as "rain+fog") is both at once. Severity is
         uniform in its range; the wind blows from any side with equal chance. Of the draws of rain
-        and snow a share `falling` falls; the others show only what it leaves behind.
+        and snow a share `falling` falls; the others show only what it leaves behind (for now the
+        overcast sky: wet ground and snow cover are not drawn yet).
 
     Raises:
         ArgumentError: If a type is unknown, a weight negative, or a range outside [0, 1].
@@ -53,14 +54,14 @@ class WeatherPolicy:
     def __post_init__(self) -> None:
         if not isinstance(self.types, Mapping) or not self.types:
             raise ArgumentError("types must map at least one weather type to its weight")
-        for name, weight in self.types.items():
+        for name in self.types:
             unknown = [part for part in str(name).split("+") if part not in TYPES]
             if unknown:
                 raise ArgumentError(
                     f"weather type {printable(unknown[0])!r} is not one of {', '.join(TYPES)}"
                 )
-            finite(f"weight of {name}", weight, 0)
-        if not 0 < sum(self.types.values()) < math.inf:
+        types = {name: finite(f"weight of {name}", w, 0) for name, w in self.types.items()}
+        if not 0 < sum(types.values()) < math.inf:
             raise ArgumentError("the weights of types must sum to a finite number above 0")
         try:
             low, high = (parse_severity(s) for s in self.severity)
@@ -70,8 +71,8 @@ class WeatherPolicy:
             ) from None
         if low > high:
             raise ArgumentError(f"severity must be a range (low, high), got {self.severity}")
-        finite("falling", self.falling, 0, 1)
-        object.__setattr__(self, "types", dict(self.types))
+        object.__setattr__(self, "falling", finite("falling", self.falling, 0, 1))
+        object.__setattr__(self, "types", types)
         object.__setattr__(self, "severity", (low, high))
 
     def draw(self, seed: int, epoch: int, item: int) -> WeatherDraw:

@@ -1,7 +1,7 @@
 """Weather of a frame with depth against the 2D weather of albumentations 2.0.8, at 512 x 1024.
 
-Ours is depth-correct, in linear light, and returns transmittance, depth, labels and an invalid mask;
-the peers return a picture. "20k" is the number of particles that are visible and drawn
+Ours is depth-correct, in linear light, and returns transmittance, depth, labels and an invalid
+mask; the peers return a picture. "20k" is the number of particles that are visible and drawn
 (`max_particles`), in rain and snow dense enough to need that many; of 20k particles in a box around
 the camera about 6.5k would be in view.
 """

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 from weather_aug.clip.types import Camera, FrameKey
 from weather_aug.errors import ArgumentError, DataError
 from weather_aug.scene.policy import WeatherPolicy
-from weather_aug.taxonomy import IGNORE, taxonomy
+from weather_aug.taxonomy import IGNORE, SKY, taxonomy
 from weather_aug.transforms.albumentations import RandomWeather, default_camera
 from weather_aug.weather import Weather
 
@@ -208,8 +210,9 @@ def test_two_workers_do_not_draw_the_same_weather(sample: Sample) -> None:
         ({"image": np.zeros((48, 64, 3), np.float32)}, "image must be uint8"),
         ({"mask": np.full((48, 64), 7.5, np.float32)}, "mask must be an integer"),
         ({"mask": np.zeros((48, 64), np.int8)}, "mask must be an integer array that holds 0..255"),
-        ({"mask": np.full((48, 64), -1)}, "train ids"),
-        ({"mask": np.full((48, 64), 1000)}, "train ids in 0..255, got up to 1000"),
+        ({"mask": np.arange(-1, 48 * 64 - 1).reshape(48, 64) % 12 - 1}, "found -1"),
+        ({"depth": np.full((48, 64), 7, np.uint16)}, "depth must be a float array"),
+        ({"mask": np.full((48, 64), 1000)}, "train ids in 0..255, found 1000"),
         ({"depth": None, "mask": None}, "pass depth=.* or a mask"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
@@ -231,6 +234,102 @@ def test_a_camera_of_another_size_is_refused(sample: Sample) -> None:
     camera = Camera(np.diag([50.0, 50, 1]), np.eye(4), 32, 32)
     with pytest.raises(DataError, match="camera"):
         RandomWeather(SNOW, p=1.0)(image=sample["image"], mask=sample["mask"], camera=camera)
+
+
+@pytest.mark.parametrize("kind", ["image", "images", "volume", "volumes"])
+def test_a_second_picture_is_refused_when_the_pipeline_is_made(kind: str) -> None:
+    """It came back as the first picture."""
+    with pytest.raises(ArgumentError, match="'right' is another picture"):
+        A.Compose([A.HorizontalFlip(), RandomWeather(SNOW)], additional_targets={"right": kind})
+
+
+@pytest.mark.parametrize(
+    ("name", "axes"), [("images", (None,)), ("volume", (None,)), ("volumes", (None, None))]
+)
+@pytest.mark.parametrize("along", [True, False])
+def test_stacks_of_pictures_are_refused(
+    sample: Sample, name: str, axes: tuple[None, ...], along: bool
+) -> None:
+    data = {name: sample["image"][axes]} | ({"image": sample["image"]} if along else {})
+    with pytest.raises(ArgumentError, match=f"'{name}' is another picture"):
+        pipeline()(**data, mask=sample["mask"])
+
+
+def test_a_call_without_a_picture_is_refused(sample: Sample) -> None:
+    with pytest.raises(ArgumentError, match="pass image="):
+        pipeline()(mask=sample["mask"])
+
+
+def test_only_the_mask_is_marked(sample: Sample) -> None:
+    """Boxes, points, instance maps and lists of masks pass through: weather moves nothing."""
+    instances = np.arange(48 * 64, dtype=np.int32).reshape(48, 64) + 1000
+    others = {
+        "instances": instances,
+        "ids": sample["mask"],
+        "mask3d": sample["mask"][None],
+        "masks": [sample["mask"] % 2, sample["mask"] % 3],
+        "bboxes": np.array([[1.0, 2.0, 30.0, 40.0]]),
+        "keypoints": np.array([[3.0, 4.0], [50.0, 40.0]]),
+    }
+    compose = A.Compose(
+        [RandomWeather(FOG, p=1.0)],
+        bbox_params=A.BboxParams("pascal_voc", label_fields=["classes"]),
+        keypoint_params=A.KeypointParams("xy"),
+        additional_targets={"depth": "mask", "instances": "mask", "ids": "mask"},
+    )
+    done = compose(**sample, **others, classes=["car"])
+    assert (done["mask"] == IGNORE).any()
+    for name, value in others.items():
+        # Compose itself scales boxes to [0, 1] and back, in float32.
+        assert np.allclose(done[name], value, rtol=0, atol=1e-4), name
+    assert done["instances"].dtype == np.int32
+    assert done["classes"] == ["car"]
+
+
+def holed(depth: np.ndarray, share: float, hole: float) -> np.ndarray:
+    """The depth with `share` of its finite pixels lost."""
+    lost = np.random.default_rng(3).random(depth.shape) < share
+    return np.where(lost & np.isfinite(depth), np.float32(hole), depth)
+
+
+@pytest.mark.parametrize("hole", [np.nan, 0.0, -1.0, -np.inf])
+@pytest.mark.parametrize("masked", [True, False])
+def test_a_sparse_depth_is_refused_not_taken_for_far(
+    sample: Sample, hole: float, masked: bool
+) -> None:
+    if not masked:
+        del sample["mask"]
+    for share in (0.6, 1.0):
+        with pytest.raises(ArgumentError, match="complete the depth first"):
+            pipeline(FOG)(**sample | {"depth": holed(sample["depth"], share, hole)})
+    pipeline(FOG)(**sample | {"depth": holed(sample["depth"], 0.4, hole)})
+
+
+def test_infinite_depth_is_sky_only_where_the_mask_allows(sample: Sample) -> None:
+    half = sample | {"depth": holed(sample["depth"], 0.6, np.inf)}
+    with pytest.raises(ArgumentError, match="complete the depth first"):
+        pipeline()(**half)
+    pipeline()(**half | {"mask": np.full((48, 64), IGNORE, np.uint8)})
+    del half["mask"]
+    pipeline()(**half)
+    with pytest.raises(ArgumentError, match="on 0% of the pixels"):
+        pipeline()(image=sample["image"], depth=np.full((48, 64), np.inf, np.float32))
+
+
+def test_a_picture_of_sky_alone_needs_no_depth(sample: Sample) -> None:
+    nothing = {"mask": np.full((48, 64), SKY, np.uint8), "depth": np.zeros((48, 64), np.float32)}
+    assert pipeline(FOG)(**sample | nothing)["image"].shape == (48, 64, 3)
+
+
+def test_without_albumentations_the_error_names_the_extra() -> None:
+    code = (
+        "import sys; sys.modules['albumentations'] = None\n"
+        "from weather_aug.errors import MissingExtraError\n"
+        "try:\n    import weather_aug.transforms.albumentations\n"
+        "except MissingExtraError as error:\n    print(error)"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert "pip install 'weather-aug[albumentations]'" in run.stdout, run.stderr
 
 
 @pytest.mark.parametrize(

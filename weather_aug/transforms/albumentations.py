@@ -5,21 +5,26 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-import albumentations as A
 import numpy as np
-from albumentations.core.transforms_interface import BaseTransformInitSchema
 from numpy.typing import NDArray
 
 from weather_aug._checks import finite, image_uint8, like_image
+from weather_aug._extras import require
 from weather_aug._keys import key_of, uniforms
 from weather_aug.clip.prior import geometric_prior_depth
 from weather_aug.clip.types import Camera, Frame, FrameKey
-from weather_aug.errors import ArgumentError
+from weather_aug.errors import ArgumentError, printable
 from weather_aug.render.compose import DEFAULT_OPTIONS, RenderedFrame, RenderOptions, render
 from weather_aug.render.light import ambience_of
 from weather_aug.scene.policy import WeatherPolicy
-from weather_aug.taxonomy import IGNORE
+from weather_aug.taxonomy import IGNORE, SKY
 from weather_aug.weather import Weather
+
+# Without it the import below would fail with no word on which extra to install.
+require("albumentations", extra="albumentations", to="use RandomWeather in a Compose")
+
+import albumentations as A  # noqa: E402
+from albumentations.core.transforms_interface import BaseTransformInitSchema  # noqa: E402
 
 UInt8 = NDArray[np.uint8]
 
@@ -27,6 +32,8 @@ STREET_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Street axes of a level camera whose own axes are the world's."""
 DEFAULT_FOV_DEG = 60.0
 EXPOSURE_S = 0.005
+_PICTURES = ("image", "images", "volume", "volumes")
+"""Kinds of targets that hold pictures; depth and mask belong to one picture alone."""
 
 
 class RandomWeather(A.DualTransform):
@@ -34,11 +41,20 @@ class RandomWeather(A.DualTransform):
 
     Convention:
         `image` is (H, W, 3) uint8 RGB; `mask` is (H, W) uint8 Cityscapes train ids and comes back
-        with 255 where the weather hides the surface. `depth` (H, W) float, metres along the optical
-        axis, and `camera` (`weather_aug.Camera`) are taken from the call where given; else depth is
-        the geometric prior of the mask (ground plane, standing objects, sky). Put it before crops
-        and flips: depth and camera belong to the whole picture. Randomness is the transform's
-        own generator (`Compose(seed=…)`), mixed with the DataLoader worker's seed.
+        with 255 where the weather hides the surface. Only the key `mask` does: weather moves
+        nothing, so every other target (`masks`, further masks such as instance maps or depth,
+        `bboxes`, `keypoints`) passes through unchanged. A second picture is refused, because it
+        would need a depth and a camera of its own.
+
+        `depth` (H, W) float, metres along the optical axis, and `camera` (`weather_aug.Camera`)
+        are taken from the call where given; else depth is the geometric prior of the mask (ground
+        plane, standing objects, sky). Unknown depth (NaN, 0, below 0) counts as far, as does `inf`,
+        so complete a sparse depth first; one that is unknown on more than half of the pixels
+        outside the sky is refused. Where no mask says what is sky, `inf` is sky.
+
+        Put the transform before crops and flips: depth and camera belong to the whole picture.
+        Randomness is the transform's own generator (`Compose(seed=…)`), mixed with the DataLoader
+        worker's seed.
 
     Args:
         policy: Which weather how often, or its `to_dict` form.
@@ -48,8 +64,10 @@ class RandomWeather(A.DualTransform):
         p: Probability of any weather.
 
     Raises:
-        ArgumentError: If an argument is out of range, or at a call an image has no depth and no
-            mask to take a prior from.
+        MissingExtraError: At import, if albumentations is not installed.
+        ArgumentError: If an argument is out of range, an additional target is a picture, or at a
+            call there is no `image`, more than one picture, too little depth, or neither depth nor
+            a mask to take a prior from.
     """
 
     class InitSchema(BaseTransformInitSchema):
@@ -87,23 +105,33 @@ class RandomWeather(A.DualTransform):
         speed = low + (high - low) * float(uniforms(key, 1)[0])
         return {"weather": draw.weather.to_dict(), "seed": draw.seed, "speed": speed}
 
+    def add_targets(self, additional_targets: dict[str, str]) -> None:
+        """Take further targets of a Compose; refuse pictures as soon as it is made."""
+        super().add_targets(additional_targets)
+        for name, kind in self._additional_targets.items():
+            if kind in _PICTURES:
+                raise _second_picture(name)
+
+    def update_transform_params(
+        self, params: dict[str, Any], data: dict[str, Any]
+    ) -> dict[str, Any]:
+        """Nothing to add: what depends on the data is checked and read when it is rendered."""
+        return params
+
     def apply_with_params(
         self, params: dict[str, Any], *args: Any, **kwargs: Any
     ) -> dict[str, Any]:
-        """Render the frame once, then hand it to each target."""
+        """Render `image`, mark in `mask` what is hidden, and hand on everything else as it is."""
+        for name in _PICTURES[1:]:
+            if kwargs.get(name) is not None:
+                raise _second_picture(name)
+        if kwargs.get("image") is None:
+            raise ArgumentError("RandomWeather needs a picture: pass image=… (H, W, 3) uint8")
         shot = self._render(params, kwargs)
-        done: dict[str, Any] = super().apply_with_params(params | {"shot": shot}, *args, **kwargs)
+        done = kwargs | {"image": shot.image}
+        if shot.label is not None:
+            done["mask"] = np.where(shot.label != shot.label_full, IGNORE, kwargs["mask"])
         return done
-
-    def apply(self, img: UInt8, shot: RenderedFrame, **params: Any) -> UInt8:
-        """The picture in weather."""
-        return shot.image
-
-    def apply_to_mask(self, mask: NDArray[Any], shot: RenderedFrame, **params: Any) -> NDArray[Any]:
-        """The mask with 255 where the weather hides the surface; depth passes through."""
-        if mask.dtype.kind == "f" or shot.label is None:
-            return mask
-        return np.where(shot.label != shot.label_full, IGNORE, mask)
 
     def _render(self, params: dict[str, Any], data: dict[str, Any]) -> RenderedFrame:
         image = image_uint8("image", data["image"])
@@ -123,6 +151,7 @@ class RandomWeather(A.DualTransform):
         if depth is not None:
             depth = np.asarray(depth)
             like_image("depth", depth, (camera.height, camera.width))
+            _check_known(depth, label)
             return depth
         if label is None:
             raise ArgumentError(
@@ -165,12 +194,44 @@ def _worker_seed() -> int:
     return 0 if info is None else int(info.seed)
 
 
+def _second_picture(name: str) -> ArgumentError:
+    return ArgumentError(
+        f"RandomWeather weathers the target image alone, and {printable(name)!r} is another "
+        "picture: call the pipeline once for each picture, or declare what is no picture as 'mask'"
+    )
+
+
+def _check_known(depth: NDArray[Any], label: UInt8 | None) -> None:
+    """Refuse a depth that is mostly holes, which the renderer would silently take for far."""
+    if depth.dtype.kind != "f":
+        raise ArgumentError(f"depth must be a float array in metres, got {depth.dtype}")
+    known = np.isfinite(depth) & (depth > 0)
+    surface = np.ones(depth.shape, bool) if label is None else label != SKY
+    open_sky = depth == np.inf
+    if label is not None:
+        open_sky &= label == IGNORE
+    expected = int(np.count_nonzero(surface & ~open_sky))
+    found = int(np.count_nonzero(surface & known))
+    if surface.any() and (found == 0 or 2 * found < expected):
+        raise ArgumentError(
+            f"depth is known (finite and above 0) on {found / max(expected, 1):.0%} of the pixels "
+            "outside the sky, and unknown depth counts as far: complete the depth first, or leave "
+            "it out to take a geometric prior from the mask"
+        )
+
+
 def _label(mask: Any, shape: tuple[int, int]) -> UInt8 | None:
     if mask is None:
         return None
+    if not isinstance(mask, np.ndarray):
+        raise ArgumentError(f"mask must be a numpy array, got {type(mask).__name__}")
     like_image("mask", mask, shape)
     if not np.can_cast(np.uint8, mask.dtype) or mask.dtype.kind not in "iu":
         raise ArgumentError(f"mask must be an integer array that holds 0..255, got {mask.dtype}")
-    if mask.min() < 0 or mask.max() > 255:
-        raise ArgumentError(f"mask must hold train ids in 0..255, got up to {mask.max()}")
+    low, high = int(mask.min()), int(mask.max())
+    if low < 0 or high > 255:
+        raise ArgumentError(
+            f"mask must hold train ids in 0..255, found {low if low < 0 else high}; map its ids "
+            "to train ids first"
+        )
     return np.ascontiguousarray(mask, dtype=np.uint8)

@@ -229,15 +229,28 @@ def test_a_transform_gets_arrays_and_gives_the_item(tiny_scene: WeatherScene) ->
     assert dataset[1][1].any()
 
 
-def test_scenes_follow_one_another(
-    tiny_scene: WeatherScene, unlabelled_scene: WeatherScene
-) -> None:
-    dataset = WeatherDataset([unlabelled_scene, tiny_scene], POLICY)
+def test_scenes_follow_one_another(tiny_scene: WeatherScene, tmp_path: Path) -> None:
+    other = WeatherScene.build(TinyClip(name="other", frames=2), tmp_path / "other")
+    dataset = WeatherDataset([other, tiny_scene], POLICY)
     recipes = [json.loads(dataset[index]["recipe"]) for index in range(len(dataset))]
-    assert [recipe["scene"] for recipe in recipes] == ["unlabelled"] * 8 + ["tiny"] * 8
+    assert [recipe["scene"] for recipe in recipes] == ["other"] * 4 + ["tiny"] * 8
     keys = [(recipe["time_index"], recipe["camera"]) for recipe in recipes]
-    assert keys == [*unlabelled_scene.keys, *tiny_scene.keys]
-    assert ["label" in dataset[index] for index in (0, 7, 8, 15)] == [False, False, True, True]
+    assert keys == [*other.keys, *tiny_scene.keys]
+
+
+def test_scenes_without_labels_give_items_without(unlabelled_scene: WeatherScene) -> None:
+    item = WeatherDataset([unlabelled_scene], POLICY)[1]
+    assert set(item) == {*PLANES, "recipe"} - {"label", "label_full"}
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_labelled_and_unlabelled_scenes_do_not_mix(
+    tiny_scene: WeatherScene, unlabelled_scene: WeatherScene, first: int
+) -> None:
+    """Their items would not collate, and only once the two met in a batch."""
+    scenes = [tiny_scene, unlabelled_scene]
+    with pytest.raises(ArgumentError, match="of scene unlabelled has no label"):
+        WeatherDataset([scenes[first], scenes[1 - first]])
 
 
 def test_a_pickled_dataset_is_small_and_draws_the_same(dataset: WeatherDataset) -> None:
@@ -290,6 +303,11 @@ def test_an_index_of_torch_or_numpy_will_do(dataset: WeatherDataset) -> None:
         ({"crop": (0, 10)}, "crop"),
         ({"crop": (10,)}, "crop"),
         ({"crop": (10.0, 10.0)}, "crop"),
+        ({"crop": 256}, r"crop must be \(height, width\) in pixels, got 256"),
+        ({"crop": {1, 2}}, "crop must be"),
+        ({"policy": {"rain": 1}}, r"WeatherPolicy\(types=\{.*\}\)"),
+        ({"policy": {}}, "policy must be a WeatherPolicy, got dict"),
+        ({"policy": "rain"}, "policy must be a WeatherPolicy, got str"),
     ],
     ids=str,
 )

@@ -29,21 +29,24 @@ class WeatherDataset(Dataset[Any]):
         Item i of epoch e is the same bytes in any process, on any number of workers, in any order,
         and another weather in another epoch. Call `set_epoch` between epochs; it reaches persistent
         workers too. Without `transform` an item is a dict of tensors: `image` (3, H, W) uint8 RGB,
-        `label` (H, W) int64 train ids with 255 where the surface cannot be seen, `invalid` (H, W)
-        uint8, `transmittance` and `depth` (H, W) float32, and `recipe`, a JSON text from which the
-        item can be rendered again. Scenes without labels give items without `label`.
+        `label` (H, W) int64 train ids with 255 where the surface cannot be seen, `label_full`
+        (H, W) int64 train ids of the clear frame, `invalid` (H, W) uint8, 1 where the surface is
+        undetectable or beyond the optical range, `transmittance` in [0, 1] and `depth` in metres
+        (H, W) float32, and `recipe`, a JSON text from which the item can be rendered again. Scenes
+        without labels give items without `label` and `label_full`; all frames have labels, or none.
 
     Args:
         scenes: One or more scenes.
-        policy: Which weather how often.
+        policy: Which weather how often; the default `WeatherPolicy()` if None.
         seed: Of all draws.
-        transform: Called with the sample as numpy arrays (`image` (H, W, 3), `label` (H, W) uint8,
-            …); what it returns is the item.
+        transform: Called with the sample as numpy arrays (`image` (H, W, 3), `label` and
+            `label_full` (H, W) uint8, …); what it returns is the item.
         crop: (height, width) of a random part to render; only that part is rendered.
         options: Budget of the renderer.
 
     Raises:
-        ArgumentError: If there are no scenes, or a frame is smaller than the crop.
+        ArgumentError: If there are no scenes, some of their frames have labels and some have none,
+            the policy is none, or a frame is smaller than the crop.
     """
 
     def __init__(
@@ -59,7 +62,7 @@ class WeatherDataset(Dataset[Any]):
         self.scenes = tuple(scenes)
         if not self.scenes or not all(isinstance(scene, WeatherScene) for scene in self.scenes):
             raise ArgumentError("scenes must be one or more of WeatherScene.load(folder)")
-        self.policy = policy or WeatherPolicy()
+        self.policy = _checked_policy(policy)
         self.seed = check_seed("seed", seed)
         self.transform = transform
         self.crop = crop
@@ -67,6 +70,7 @@ class WeatherDataset(Dataset[Any]):
         self._ends = np.cumsum([len(scene.keys) for scene in self.scenes])
         # Shared memory, because persistent workers hold a copy of everything else.
         self._epoch = torch.zeros(1, dtype=torch.int64).share_memory_()
+        self._check_labels()
         self._check_crop()
         if get_worker_info() is None:
             warm_up()
@@ -121,10 +125,22 @@ class WeatherDataset(Dataset[Any]):
         left = int(right * (width - columns + 1))
         return (top, left, rows, columns)
 
+    def _check_labels(self) -> None:
+        """Refuse a mixture: its items differ in their keys, and no batch could hold two of them."""
+        frames = [(scene, record) for scene in self.scenes for record in scene.manifest.frames]
+        without = [frame for frame in frames if "label" not in frame[1].files]
+        if without and len(without) < len(frames):
+            scene, record = without[0]
+            raise ArgumentError(
+                f"frame {record.key} of scene {scene.name} has no label, but other frames have: "
+                "make one WeatherDataset of labelled scenes and another of those without labels"
+            )
+
     def _check_crop(self) -> None:
         if self.crop is None:
             return
-        if len(self.crop) != 2 or not all(isinstance(side, int) for side in self.crop):
+        pair = isinstance(self.crop, tuple | list) and len(self.crop) == 2
+        if not pair or not all(isinstance(side, int) for side in self.crop):
             raise ArgumentError(f"crop must be (height, width) in pixels, got {self.crop!r}")
         for scene in self.scenes:
             for key in scene.keys:
@@ -134,6 +150,17 @@ class WeatherDataset(Dataset[Any]):
                         f"crop {self.crop} does not fit frame {key} of scene {scene.name} "
                         f"({height}x{width} pixels)"
                     )
+
+
+def _checked_policy(policy: Any) -> WeatherPolicy:
+    if policy is None:
+        return WeatherPolicy()
+    if not isinstance(policy, WeatherPolicy):
+        raise ArgumentError(
+            f"policy must be a WeatherPolicy, got {type(policy).__name__}; write "
+            'WeatherPolicy(types={"rain": 1, …}), or WeatherPolicy.from_dict(…) of a to_dict form'
+        )
+    return policy
 
 
 def _sample(shot: RenderedFrame, recipe: str) -> Sample:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -108,6 +110,17 @@ def test_the_airlight_is_the_clips_median(tiny_clip: TinyClip, tiny_scene: Weath
     assert tiny_scene.manifest.airlight.tolist() == np.median(measured, axis=0).tolist()
 
 
+def test_unrelated_pictures_have_no_airlight_in_common(out: Path) -> None:
+    clip = Watched()
+    clip.is_drive = False  # type: ignore[attr-defined]
+    scene = WeatherScene.build(clip, out)
+    assert scene.manifest.airlight is None
+    for key in clip.keys:
+        expected = ambience_of(TinyClip().frame(key), np.eye(3)).airlight
+        assert scene.ambience(key).airlight.tolist() == expected.tolist()
+    assert len({tuple(scene.ambience(key).airlight) for key in clip.keys}) > 1
+
+
 def test_street_axes_are_the_way_the_rig_went(tiny_scene: WeatherScene) -> None:
     assert np.allclose(np.eye(3), tiny_scene.manifest.axes_world)
 
@@ -203,10 +216,27 @@ def test_bad_input_leaves_nothing_behind(out: Path, clip: Watched) -> None:
     assert list(out.parent.iterdir()) == []
 
 
-def test_a_missing_parent_folder_is_an_output_error(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="does not exist"):
-        WeatherScene.build(TinyClip(), tmp_path / "a" / "scene")
-    assert list(tmp_path.iterdir()) == []
+def test_missing_parent_folders_are_made(tmp_path: Path) -> None:
+    scene = WeatherScene.build(TinyClip(frames=1), tmp_path / "a" / "b" / "scene")
+    assert [path.name for path in (tmp_path / "a" / "b").iterdir()] == ["scene"]
+    assert scene.damaged_files() == []
+
+
+def test_a_parent_that_is_a_file_is_an_output_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(OutputError, match="cannot write"):
+        WeatherScene.build(TinyClip(), tmp_path / "file" / "scene")
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.parametrize("below", ["scene", "frames/a/scene"])
+def test_a_place_inside_a_scene_is_refused(out: Path, below: str) -> None:
+    WeatherScene.build(TinyClip(frames=1), out)
+    before = digests_of(out.parent)
+    with pytest.raises(OutputError, match="lies inside the scene"):
+        WeatherScene.build(TinyClip(), out / below)
+    assert digests_of(out.parent) == before
+    assert not (out / "frames" / "a").exists()
 
 
 def test_a_full_disk_keeps_the_work_and_says_so(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -242,6 +272,20 @@ def test_what_stands_there_is_not_touched(out: Path, kind: str, overwrite: bool)
     assert digests_of(out.parent) == before
 
 
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_scene_without_manifest_is_left_to_the_user(out: Path, overwrite: bool) -> None:
+    """The cure that is named works; overwrite would not."""
+    WeatherScene.build(TinyClip(frames=1), out)
+    (out / store.MANIFEST).unlink()
+    before = digests_of(out)
+    with pytest.raises(ConflictError, match=r"remove it yourself.*overwrite does not") as caught:
+        WeatherScene.build(TinyClip(frames=1), out, overwrite=overwrite)
+    assert "pass overwrite" not in str(caught.value)
+    assert digests_of(out) == before
+    shutil.rmtree(out)
+    assert WeatherScene.build(TinyClip(frames=1), out).damaged_files() == []
+
+
 def test_a_scene_is_replaced_only_when_asked(out: Path) -> None:
     first = WeatherScene.build(TinyClip(frames=1), out)
     before = digests_of(out)
@@ -251,6 +295,107 @@ def test_a_scene_is_replaced_only_when_asked(out: Path) -> None:
     second = WeatherScene.build(TinyClip(frames=2), out, overwrite=True)
     assert (len(first.keys), len(second.keys)) == (2, 4)
     assert set(digests_of(out)) == {store.MANIFEST, *second.manifest.files}
+    assert list(out.parent.iterdir()) == [out]
+
+
+def test_a_link_to_a_scene_stays_a_link(out: Path, tmp_path: Path) -> None:
+    WeatherScene.build(TinyClip(frames=1), out)
+    link = tmp_path / "link"
+    link.symlink_to(out)
+    WeatherScene.build(TinyClip(frames=2), link, overwrite=True)
+    assert link.is_symlink()
+    assert len(WeatherScene.load(out).keys) == 4
+
+
+def _cut_short(call: int, action: Callable[[], object]) -> bool:
+    """Run `action` in a child that ends at its `call`-th change of a folder; whether it did."""
+    child = os.fork()
+    if child:
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
+    calls = 0
+
+    def counted(function: Callable[..., Any]) -> Callable[..., Any]:
+        def inner(*arguments: Any, **options: Any) -> Any:
+            nonlocal calls
+            calls += 1
+            if calls == call:
+                os._exit(9)
+            return function(*arguments, **options)
+
+        return inner
+
+    for name in ("rename", "replace", "unlink", "rmdir", "fsync"):
+        setattr(os, name, counted(getattr(os, name)))
+    try:
+        action()
+    finally:
+        os._exit(0)
+
+
+def test_a_replacement_cut_short_anywhere_leaves_one_whole_scene(tmp_path: Path) -> None:
+    old = WeatherScene.build(TinyClip(frames=1), tmp_path / "old")
+    new = WeatherScene.build(TinyClip(frames=2), tmp_path / "new")
+    found = []
+    for call in range(1, 100):
+        out = tmp_path / str(call) / "scene"
+        work = out.with_name(out.name + WORK)
+        shutil.copytree(old.path, out)
+        shutil.copytree(new.path, work)
+        was_cut = _cut_short(call, lambda work=work, out=out: building._publish(work, out))
+        with pytest.raises(ConflictError, match="exists"):
+            WeatherScene.build(TinyClip(frames=2), out)
+        found.append(WeatherScene.load(out, verify=True).digest)
+        assert {path.name for path in out.parent.iterdir()} <= {"scene", work.name}
+        if not was_cut:
+            break
+    assert not was_cut
+    assert list(dict.fromkeys(found)) == [old.digest, new.digest]
+    assert len(found) > 10
+
+
+def test_a_replacement_that_fails_puts_the_old_scene_back(
+    out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = WeatherScene.build(TinyClip(frames=1), out)
+    rename = Path.rename
+
+    def refused(path: Path, target: Path) -> Path:
+        if path.name.endswith(WORK):
+            raise OSError(5, "Input/output error")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", refused)
+    with pytest.raises(OutputError, match="Input/output error"):
+        WeatherScene.build(TinyClip(frames=2), out, overwrite=True)
+    assert WeatherScene.load(out, verify=True).digest == old.digest
+
+
+def test_a_strangers_folder_in_the_way_is_not_removed(out: Path) -> None:
+    stranger = out.with_name("scene.replaced")
+    stranger.mkdir()
+    (stranger / "thesis.txt").write_text("mine")
+    with pytest.raises(ConflictError, match=r"scene\.replaced.*move it elsewhere"):
+        WeatherScene.build(TinyClip(frames=1), out)
+    assert digests_of(out.parent).keys() == {"scene.replaced/thesis.txt"}
+
+
+# Alone
+
+
+def test_a_second_build_of_one_output_is_refused_and_harms_nothing(
+    tiny_scene: WeatherScene, out: Path
+) -> None:
+    refused = []
+
+    def meanwhile(key: FrameKey) -> None:
+        with pytest.raises(ConflictError, match=f"being built by process {os.getpid()} on") as told:
+            WeatherScene.build(TinyClip(), out, overwrite=True)
+        refused.append(told.value.exit_code)
+
+    WeatherScene.build(Watched(fault=meanwhile), out)
+    assert refused == [5] * len(tiny_scene.keys)
+    assert digests_of(out) == digests_of(tiny_scene.path)
+    assert list(out.parent.iterdir()) == [out]
 
 
 # Continued
@@ -375,6 +520,8 @@ def test_a_killed_build_is_continued(tiny_scene: WeatherScene, out: Path) -> Non
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == b"ready\n"
+        with pytest.raises(ConflictError, match=f"by process {process.pid} on"):
+            WeatherScene.build(TinyClip(), out)
         process.send_signal(signal.SIGKILL)
         assert process.wait(timeout=30) == -signal.SIGKILL
     assert not out.exists()
@@ -383,6 +530,7 @@ def test_a_killed_build_is_continued(tiny_scene: WeatherScene, out: Path) -> Non
     keys = TinyClip().keys
     assert again.read == [keys[0], *keys[5:]]
     assert digests_of(out) == digests_of(tiny_scene.path)
+    assert list(out.parent.iterdir()) == [out]
 
 
 _KILLED_ANYWHERE = """

@@ -36,11 +36,13 @@ def folder(tiny_scene: WeatherScene, tmp_path: Path) -> Path:
 
 
 def rewrite(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    """Edit the manifest as JSON."""
+    """Edit the manifest as JSON and seal it again, as somebody would on purpose."""
     path = folder / store.MANIFEST
     content = json.loads(path.read_text())
     change(content)
-    path.write_text(json.dumps(content))
+    content.pop("sha256", None)
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    path.write_text(json.dumps(content | {"sha256": _files.sha256_of(text.encode())}))
 
 
 def plant(folder: Path, relative: str, data: bytes) -> None:
@@ -185,6 +187,34 @@ def test_a_changed_manifest_is_another_scene(folder: Path) -> None:
     assert WeatherScene.load(folder).digest != before
 
 
+@pytest.mark.parametrize("field", ["airlight", "intrinsics", "time_s", "sha256"])
+def test_one_changed_digit_of_the_manifest_is_found_at_load(folder: Path, field: str) -> None:
+    """Of a number that stays in its range, so that nothing else can tell."""
+    path = folder / store.MANIFEST
+    text = path.read_text()
+    start = text.rindex(f'"{field}"')
+    # The second digit, lest a leading one turns into 0 or the number leaves its range.
+    place = [i for i in range(start + len(field) + 2, len(text)) if text[i].isdigit()][1]
+    path.write_text(f"{text[:place]}{(int(text[place]) + 1) % 10}{text[place + 1 :]}")
+    with pytest.raises(IntegrityError, match=r"scene\.json has changed.*build the scene again"):
+        WeatherScene.load(folder)
+
+
+def test_a_manifest_without_its_seal_is_found_at_load(folder: Path) -> None:
+    path = folder / store.MANIFEST
+    content = json.loads(path.read_text())
+    assert len(content.pop("sha256")) == 64
+    path.write_text(json.dumps(content))
+    with pytest.raises(IntegrityError, match="has changed"):
+        WeatherScene.load(folder)
+
+
+def test_the_seal_is_of_the_content_not_of_its_layout(folder: Path) -> None:
+    path = folder / store.MANIFEST
+    path.write_text(json.dumps(json.loads(path.read_text()), sort_keys=True))
+    assert WeatherScene.load(folder).keys
+
+
 def _truncate(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1])
 
@@ -282,7 +312,7 @@ FAR = [[1, 0, 0, 1e300], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 HOSTILE: dict[str, Callable[[dict[str, Any]], None]] = {
     **{f"without {name}": _drop(name) for name in (*FIELDS, "frames", "files")},
     **{f"frame without {name}": _drop("frames", 0, name) for name in FRAME_FIELDS},
-    **{f"{name} null": _set(name, to=None) for name in (*FIELDS, "frames", "files")},
+    **{f"{name} null": _set(name, to=None) for name in (*FIELDS[:-1], "frames", "files")},
     **{f"frame {name} null": _frame(name, None) for name in FRAME_FIELDS},
     **{f"frame {name} text": _frame(name, "../x") for name in FRAME_FIELDS},
     **{f"frame {name} huge": _frame(name, HUGE) for name in FRAME_FIELDS if name != "time_index"},
@@ -333,6 +363,7 @@ HOSTILE: dict[str, Callable[[dict[str, Any]], None]] = {
     "a light of text": _set("frames", 0, "light", "sky", to=["a", "b", "c"]),
     "a light of two": _set("frames", 0, "light", "sky", to=[0.5, 0.5]),
     "a light missing": _drop("frames", 0, "light", "ground"),
+    "a frame without airlight": _drop("frames", 0, "light", "airlight"),
 }
 
 

@@ -301,15 +301,22 @@ def test_unusable_outputs_are_refused_before_the_first_render(
         (scene.path, OutputError, "inside the scene"),
         (inside / "out", OutputError, "inside the scene"),
         (file, OutputError, "not a folder"),
-        (file / "out", OutputError, "does not exist"),
+        (file / "out", OutputError, "cannot write"),
         (loop, OutputError, "cannot write"),
-        (tmp_path / "absent" / "out", OutputError, "does not exist"),
         (full, ConflictError, "holds mine"),
     ]:
         with pytest.raises(error, match=words):
             export(plan, out)
     assert sorted(path.name for path in full.iterdir()) == ["mine"]
     assert WeatherScene.load(scene.path, verify=True).damaged_files() == []
+
+
+def test_missing_parent_folders_are_made(
+    plan: ExportPlan, tmp_path: Path, expected_tree: dict[str, str]
+) -> None:
+    out = tmp_path / "a" / "b" / "out"
+    assert export(plan, out).samples == 10
+    assert tree_of(out) == expected_tree
 
 
 @pytest.mark.parametrize("workers", [-1, 1025, 1.5, True])

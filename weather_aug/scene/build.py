@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from weather_aug import _files
+from weather_aug import _files, _lock
 from weather_aug.clip.types import Clip, Frame
 from weather_aug.errors import (
     ArgumentError,
@@ -28,6 +29,8 @@ from weather_aug.scene.policy import TYPES
 EDITORS = ("physical",)
 JOURNAL = "journal.jsonl"
 UNFINISHED_SUFFIX = ".building"
+LOCK_SUFFIX = ".building.lock"
+REPLACED_SUFFIX = ".replaced"
 
 Float64 = NDArray[np.float64]
 
@@ -45,11 +48,12 @@ def build(
 
     Work in progress stands in `out` + ".building" with a journal of finished frames; the same call
     again continues it, after making the first finished frame once more to see that the clip is
-    still the same. Bad input removes it: there is nothing to continue.
+    still the same. Bad input removes it: there is nothing to continue. A scene that is replaced
+    stands in `out` + ".replaced" until the new one is in its place.
 
     Args:
         clip: The drive; every frame needs depth.
-        out: Folder to make.
+        out: Folder to make, and its parents.
         editor: How backgrounds get their weather; "physical" does it while rendering.
         weathers: Types the scene is meant for.
         progress: Show a bar.
@@ -57,34 +61,44 @@ def build(
 
     Raises:
         ArgumentError: If the editor or a weather is unknown.
-        ConflictError: If `out` exists.
+        ConflictError: If `out` exists, or another process builds it.
         ClipError: If the clip is empty or too long, or a frame has no depth.
         SceneError: If a name cannot stand in a file name, or a frame cannot be stored.
-        OutputError: If the output cannot be written.
+        OutputError: If the output lies inside another scene, or cannot be written.
     """
-    _check(clip, out, editor, weathers, overwrite)
-    work = out.with_name(out.name + UNFINISHED_SUFFIX)
-    try:
-        entries, files = _write_frames(clip, work, progress)
-        content = {
-            "name": clip.name,
-            "editor": editor,
-            "weathers": list(weathers),
-            "axes_world": street_axes(entries, clip.up_world).tolist(),
-            "airlight": np.median([entry.pop("airlight") for entry in entries], axis=0).tolist(),
-            "frames": entries,
-            "files": files,
-        }
-    except DataError:
-        shutil.rmtree(work, ignore_errors=True)
-        raise
-    _files.write_whole(work / store.MANIFEST, store.manifest_bytes(content))
-    with _files.reported(out):
-        (work / JOURNAL).unlink(missing_ok=True)
-        if overwrite and out.exists():
-            shutil.rmtree(out)
-        work.replace(out)
-        _files.sync_folder(out.parent)
+    _check_choices(editor, weathers)
+    _check_clip(clip)
+    out = _located(out)
+    with _held(out):
+        _settle_replacement(out)
+        _check_free(out, overwrite)
+        work = _beside(out, UNFINISHED_SUFFIX)
+        try:
+            content = _content(clip, work, editor, weathers, progress)
+        except DataError:
+            shutil.rmtree(work, ignore_errors=True)
+            raise
+        _files.write_whole(work / store.MANIFEST, store.manifest_bytes(content))
+        _publish(work, out)
+
+
+def _content(
+    clip: Clip, work: Path, editor: str, weathers: Sequence[str], progress: bool
+) -> dict[str, Any]:
+    """Write all frames into `work`; what the manifest says of them."""
+    entries, files = _write_frames(clip, work, progress)
+    airlight = None
+    if getattr(clip, "is_drive", True):
+        airlight = np.median([entry["light"]["airlight"] for entry in entries], axis=0).tolist()
+    return {
+        "name": clip.name,
+        "editor": editor,
+        "weathers": list(weathers),
+        "axes_world": street_axes(entries, clip.up_world).tolist(),
+        "airlight": airlight,
+        "frames": entries,
+        "files": files,
+    }
 
 
 def street_axes(entries: Sequence[dict[str, Any]], up_world: Float64) -> Float64:
@@ -106,20 +120,112 @@ def street_axes(entries: Sequence[dict[str, Any]], up_world: Float64) -> Float64
     return np.stack([along, np.cross(up, along), up])
 
 
-def _check(clip: Clip, out: Path, editor: str, weathers: Sequence[str], overwrite: bool) -> None:
+def _check_choices(editor: str, weathers: Sequence[str]) -> None:
     if editor not in EDITORS:
         raise ArgumentError(f"editor {printable(editor)!r} is not one of {', '.join(EDITORS)}")
     unknown = sorted(set(weathers) - set(TYPES))
     if unknown:
         raise ArgumentError(f"weather {printable(unknown[0])!r} is not one of {', '.join(TYPES)}")
-    _check_clip(clip)
-    if out.exists() and not (overwrite and (out / store.MANIFEST).is_file()):
-        raise ConflictError(
-            f"{printable(out, 200)} exists; choose another folder, or pass overwrite to replace a "
-            "scene"
+
+
+def _located(out: Path) -> Path:
+    """`out` without links, so that one folder has one lock; refuse a place inside a scene."""
+    try:
+        located = out.resolve()
+        scenes = [folder for folder in located.parents if _is_scene(folder)]
+    except (OSError, RuntimeError, ValueError) as error:
+        raise OutputError(f"cannot write to {printable(out, 200)}: {error}") from None
+    if not located.name:
+        raise ConflictError(f"{printable(out, 200)} exists; choose another folder")
+    if scenes:
+        raise OutputError(
+            f"{printable(out, 200)} lies inside the scene {printable(scenes[0], 200)}; choose a "
+            "folder outside it"
         )
-    if not out.absolute().parent.is_dir():
-        raise OutputError(f"the folder {printable(out.absolute().parent, 200)} does not exist")
+    return located
+
+
+def _is_scene(folder: Path) -> bool:
+    return (folder / store.MANIFEST).is_file() and (folder / store.FRAMES).is_dir()
+
+
+def _check_free(out: Path, overwrite: bool) -> None:
+    if not out.exists():
+        return
+    if not (out / store.MANIFEST).is_file():
+        raise ConflictError(
+            f"{printable(out, 200)} exists; choose another folder, or remove it yourself: it is no "
+            f"scene (no {store.MANIFEST}), so overwrite does not replace it"
+        )
+    if not overwrite:
+        raise ConflictError(
+            f"{printable(out, 200)} exists; choose another folder, or pass overwrite to replace "
+            "the scene"
+        )
+
+
+def _beside(out: Path, suffix: str) -> Path:
+    return out.with_name(out.name + suffix)
+
+
+@contextmanager
+def _held(out: Path) -> Iterator[None]:
+    """Build `out` alone; the lock's file goes with the lock."""
+    path = _beside(out, LOCK_SUFFIX)
+    with _lock.exclusive(path, f"{printable(out, 200)} is being built"):
+        try:
+            yield
+        finally:
+            with _files.reported(path):
+                path.unlink(missing_ok=True)
+
+
+def _publish(work: Path, out: Path) -> None:
+    """Put finished work in its place; whenever this is cut short, one whole scene is left."""
+    replaced = _beside(out, REPLACED_SUFFIX)
+    with _files.reported(out):
+        (work / JOURNAL).unlink(missing_ok=True)
+        try:
+            if out.exists():
+                out.rename(replaced)
+                _files.sync_folder(out.parent)
+            work.rename(out)
+        finally:
+            _files.sync_folder(out.parent)
+            _settle_replacement(out)
+
+
+def _settle_replacement(out: Path) -> None:
+    """Put back the scene of a replacement that was cut short, or remove it if a new one stands."""
+    replaced = _beside(out, REPLACED_SUFFIX)
+    if not replaced.exists():
+        return
+    with _files.reported(replaced):
+        if not any(replaced.iterdir()):
+            replaced.rmdir()
+        elif not (replaced / store.MANIFEST).is_file():
+            raise ConflictError(
+                f"{printable(replaced, 200)} stands where a replaced scene is kept, but is none; "
+                "move it elsewhere"
+            )
+        elif out.exists():
+            _remove_scene(replaced)
+        else:
+            replaced.rename(out)
+        _files.sync_folder(out.parent)
+
+
+def _remove_scene(folder: Path) -> None:
+    """Remove a scene, its manifest last: what is cut short is still known as a scene."""
+    for entry in folder.iterdir():
+        if entry.name == store.MANIFEST:
+            continue
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.rmtree(entry)
+        else:
+            entry.unlink()
+    (folder / store.MANIFEST).unlink(missing_ok=True)
+    folder.rmdir()
 
 
 def _check_clip(clip: Clip) -> None:
@@ -182,7 +288,7 @@ def _stored(frame: Frame, up_world: Float64) -> tuple[dict[str, Any], dict[str, 
     parts = {
         store.part_path(frame.key, part): data for part, data in store.encode_frame(frame).items()
     }
-    entry = store.frame_record(frame, ambience) | {"airlight": ambience.airlight.tolist()}
+    entry = store.frame_record(frame, ambience)
     files = {
         relative: {"size": len(data), "sha256": _files.sha256_of(data)}
         for relative, data in parts.items()

@@ -103,9 +103,15 @@ class WeatherScene:
         return store.read_frame(self.path, self._record(key))
 
     def ambience(self, key: FrameKey) -> Ambience:
-        """Light around a frame; the airlight and the axes are the clip's."""
-        manifest = self.manifest
-        return Ambience(manifest.axes_world, **self._record(key).light, airlight=manifest.airlight)
+        """Light around a frame; the axes are the clip's.
+
+        The airlight is the clip's too if it is a drive: fog does not flicker. Of unrelated pictures
+        each has its own.
+        """
+        light = dict(self._record(key).light)
+        if self.manifest.airlight is not None:
+            light["airlight"] = self.manifest.airlight
+        return Ambience(self.manifest.axes_world, **light)
 
     def render(
         self,

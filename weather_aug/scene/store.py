@@ -1,11 +1,12 @@
 """The scene folder: one JSON manifest and, per frame, a picture and two arrays.
 
-    scene.json                          version, street axes, airlight, cameras, files
+    scene.json                          version, street axes, cameras, light, files, own digest
     frames/000012_front.png             the recorded picture, lossless
     frames/000012_front.depth.npy       (H, W) float16 z-depth, metres, inf for the sky
     frames/000012_front.label.npy       (H, W) uint8 train ids, where the clip is labelled
 
-Data only: nothing in it can run code, and every file has its size and SHA-256 in the manifest.
+Data only: nothing in it can run code, every file has its size and SHA-256 in the manifest, and the
+manifest has its own.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug import _files
+from weather_aug._png import png_bytes
 from weather_aug.clip.types import RIGID_TOLERANCE, Camera, Frame, FrameKey
 from weather_aug.errors import DataError, IntegrityError, SceneError, printable
 from weather_aug.render.light import Ambience
@@ -32,6 +34,7 @@ FORMAT = "weather_aug scene"
 VERSION = 1
 MANIFEST = "scene.json"
 FRAMES = "frames"
+LIGHTS = ("sky", "middle", "ground", "airlight")
 MAX_FRAMES = 20_000
 MAX_MANIFEST_BYTES = 64 * 2**20
 """More than MAX_FRAMES entries of the longest names take, so that what is built can be opened."""
@@ -40,10 +43,12 @@ LARGEST = 1e10
 """No coordinate (metres, pixels), speed or time (seconds) of a drive is greater."""
 
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
-_PNG_LEVEL = 3
 _DEPTH, _LABEL = "<f2", "|u1"
 _PNG_START = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
-_MALFORMED = (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError)
+_MALFORMED = (
+    *(KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError),
+    RecursionError,
+)
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,7 @@ class FrameRecord:
     time_s: float
     camera: Camera
     light: Mapping[str, NDArray[np.float64]]
-    """Linear RGB medians of `sky`, `middle` and `ground`."""
+    """Linear RGB of `sky`, `middle` and `ground` (medians) and of the frame's own `airlight`."""
     files: Mapping[str, str]
     """Relative path by part: `image`, `depth`, and `label` where there is one."""
 
@@ -75,7 +80,8 @@ class Manifest:
     editor: str
     weathers: tuple[str, ...]
     axes_world: NDArray[np.float64]
-    airlight: NDArray[np.float64]
+    airlight: NDArray[np.float64] | None
+    """Of the whole drive, linear RGB; None where pictures are unrelated and each has its own."""
     frames: tuple[FrameRecord, ...]
     files: Mapping[str, StoredFile]
     digest: str = ""
@@ -103,14 +109,7 @@ def encode_frame(frame: Frame) -> dict[str, bytes]:
     check_scale(frame.key, frame.camera, frame.time_s)
     with np.errstate(over="ignore"):
         stored = np.where(depth > 0, depth, np.inf).astype(np.float16)
-    ok, png = cv2.imencode(
-        ".png",
-        cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR),
-        [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL],
-    )
-    if not ok:
-        raise SceneError(f"frame {frame.key}: the picture cannot be encoded as PNG")
-    parts = {"image": png.tobytes(), "depth": _npy(stored, _DEPTH)}
+    parts = {"image": png_bytes(frame.image), "depth": _npy(stored, _DEPTH)}
     if frame.label is not None:
         parts["label"] = _npy(frame.label, _LABEL)
     return parts
@@ -138,15 +137,23 @@ def frame_record(frame: Frame, ambience: Ambience) -> dict[str, Any]:
         "aperture_m": camera.aperture_m,
         "velocity_m_per_s": camera.velocity_m_per_s.tolist(),
         "angular_velocity_rad_per_s": camera.angular_velocity_rad_per_s.tolist(),
-        "light": {name: getattr(ambience, name).tolist() for name in ("sky", "middle", "ground")},
+        "light": {name: getattr(ambience, name).tolist() for name in LIGHTS},
         "files": {part: part_path(frame.key, part) for part in parts},
     }
 
 
 def manifest_bytes(content: dict[str, Any]) -> bytes:
-    """The manifest as it stands on disk."""
-    head = {"format": FORMAT, "version": VERSION}
-    return (json.dumps(head | content, indent=1, allow_nan=False) + "\n").encode()
+    """The manifest as it stands on disk, with its own digest as the last field."""
+    content = {"format": FORMAT, "version": VERSION} | content
+    sealed = content | {"sha256": _seal_of(content)}
+    return (json.dumps(sealed, indent=1, allow_nan=False) + "\n").encode()
+
+
+def _seal_of(content: Mapping[str, Any]) -> str:
+    """SHA-256 of the content without its own digest, however its text is laid out."""
+    unsealed = {name: value for name, value in content.items() if name != "sha256"}
+    text = json.dumps(unsealed, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return _files.sha256_of(text.encode())
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -154,7 +161,7 @@ def read_manifest(folder: Path) -> Manifest:
 
     Raises:
         SceneError: If the folder is no scene, of a newer version, or its manifest is malformed.
-        IntegrityError: If a file is missing or has another size.
+        IntegrityError: If the manifest has changed, or a file is missing or has another size.
     """
     path = folder / MANIFEST
     if not path.is_file():
@@ -165,6 +172,7 @@ def read_manifest(folder: Path) -> Manifest:
     content = _files.read_json(path, MAX_MANIFEST_BYTES)
     try:
         manifest = _parse(content, path)
+        intact = content.get("sha256") == _seal_of(content)
     except SceneError:
         raise
     except _MALFORMED as error:
@@ -172,6 +180,10 @@ def read_manifest(folder: Path) -> Manifest:
             f"{printable(path, 200)} is malformed: {type(error).__name__} {printable(error)}; "
             "build the scene again"
         ) from None
+    if not intact:
+        raise IntegrityError(
+            f"{printable(path, 200)} has changed since it was written; build the scene again"
+        )
     for relative, stored in manifest.files.items():
         file = _existing(folder, relative)
         if file.stat().st_size != stored.size:
@@ -314,7 +326,7 @@ def _parse(content: Any, path: Path) -> Manifest:
         editor=check_name("editor", content["editor"]),
         weathers=tuple(check_name("weather", name) for name in content["weathers"]),
         axes_world=_axes(content["axes_world"]),
-        airlight=_light(content["airlight"]),
+        airlight=None if content["airlight"] is None else _light(content["airlight"]),
         frames=frames,
         files=files,
         digest=_files.sha256_of_file(path),
@@ -335,7 +347,7 @@ def _parse_frame(entry: Any) -> FrameRecord:
     files = {part: str(entry["files"][part]) for part in ("image", "depth")}
     if "label" in entry["files"]:
         files["label"] = str(entry["files"]["label"])
-    light = {name: _light(entry["light"][name]) for name in ("sky", "middle", "ground")}
+    light = {name: _light(entry["light"][name]) for name in LIGHTS}
     key = FrameKey(int(entry["time_index"]), check_name("camera", entry["camera"]))
     time_s = float(entry["time_s"])
     check_scale(key, camera, time_s)

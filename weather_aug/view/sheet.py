@@ -12,6 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from weather_aug import _files
 from weather_aug._checks import finite
+from weather_aug._png import png_bytes
 from weather_aug.clip.types import FrameKey
 from weather_aug.errors import ArgumentError
 from weather_aug.render.compose import RenderedFrame
@@ -144,13 +145,13 @@ def write_png(path: Path, image: UInt8) -> None:
     """Write an (H, W, 3) picture or an (H, W) label, whole or not at all; its folder is made.
 
     Raises:
+        ArgumentError: If it is no such picture.
         OutputError: If it cannot be written.
     """
-    ok, png = cv2.imencode(".png", image if image.ndim == 2 else image[..., ::-1])
-    assert ok, "an 8-bit RGB array always encodes"
+    png = png_bytes(image)
     with _files.reported(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-    _files.write_whole(path, png.tobytes())
+    _files.write_whole(path, png)
 
 
 def _label(shot: RenderedFrame) -> UInt8:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import fcntl
-import json
 import os
-import socket
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from weather_aug import _files
+from weather_aug import _files, _lock
 from weather_aug.errors import ConflictError, OutputError, printable
 from weather_aug.writers import layout
 
@@ -31,19 +29,17 @@ def exclusive(out: Path) -> Iterator[None]:
         OutputError: If the lock cannot be written.
     """
     state = out / layout.STATE
-    descriptor = _acquired(state)
-    try:
-        _wait_for_orphans(state)
-        yield
-    finally:
-        if not (out / layout.JOURNAL).exists():
-            with suppress(OSError):
-                for file in state.iterdir():
-                    file.unlink()
-                state.rmdir()
-        # Closing is not enough if this process was forked meanwhile: the child has the lock too.
-        fcntl.flock(descriptor, fcntl.LOCK_UN)
-        os.close(descriptor)
+    busy = f"{printable(out, 200)} is being exported to"
+    with _lock.exclusive(state / _LOCK, busy):
+        try:
+            _wait_for_orphans(state)
+            yield
+        finally:
+            if not (out / layout.JOURNAL).exists():
+                with suppress(OSError):
+                    for file in state.iterdir():
+                        file.unlink()
+                    state.rmdir()
 
 
 @contextmanager
@@ -55,68 +51,11 @@ def working(out: Path) -> Iterator[None]:
     """
     descriptor = os.open(out / layout.STATE / _FENCE, os.O_RDWR | os.O_CREAT, 0o644)
     try:
-        if not _locked(descriptor, fcntl.LOCK_SH):
+        if not _lock.try_lock(descriptor, fcntl.LOCK_SH):
             raise ConflictError(f"{printable(out, 200)} was taken over by another exporter")
         yield
     finally:
         os.close(descriptor)
-
-
-def _acquired(state: Path) -> int:
-    """A descriptor that holds the lock."""
-    path = state / _LOCK
-    with _files.reported(path):
-        while True:
-            state.mkdir(exist_ok=True)
-            try:
-                descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-            except FileNotFoundError:
-                continue
-            if not _locked(descriptor, fcntl.LOCK_EX):
-                os.close(descriptor)
-                raise ConflictError(_held_message(path))
-            if _is_still(path, descriptor):
-                break
-            # The last holder finished and removed the file between our open and our lock.
-            os.close(descriptor)
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, _holder(), 0)
-    return descriptor
-
-
-def _locked(descriptor: int, mode: int) -> bool:
-    try:
-        fcntl.flock(descriptor, mode | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
-
-
-def _is_still(path: Path, descriptor: int) -> bool:
-    try:
-        return os.path.samestat(path.stat(), os.fstat(descriptor))
-    except FileNotFoundError:
-        return False
-
-
-def _holder() -> bytes:
-    return json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode()
-
-
-def _held_message(path: Path) -> str:
-    """Who holds the lock; a holder writes its name a moment after it has the lock."""
-    who = "another process"
-    for _ in range(20):
-        try:
-            holder = json.loads(path.read_text())
-            who = f"process {int(holder['pid'])} on {printable(holder['host'])}"
-            break
-        except (OSError, ValueError, KeyError, TypeError):
-            time.sleep(0.02)
-    return (
-        f"{printable(path.parent.parent, 200)} is being exported to by {who}; wait for it, or "
-        "choose another folder"
-    )
 
 
 def _wait_for_orphans(state: Path) -> None:
@@ -125,7 +64,7 @@ def _wait_for_orphans(state: Path) -> None:
         descriptor = os.open(fence, os.O_RDWR | os.O_CREAT, 0o644)
     try:
         deadline = time.monotonic() + ORPHANS_WAIT_S
-        while not _locked(descriptor, fcntl.LOCK_EX):
+        while not _lock.try_lock(descriptor, fcntl.LOCK_EX):
             if time.monotonic() > deadline:
                 raise ConflictError(
                     f"workers of an earlier export still write to {printable(state.parent, 200)}; "
@@ -155,10 +94,8 @@ def check_output(out: Path, scenes: list[Path]) -> Path:
         )
     if out.exists() and not out.is_dir():
         raise OutputError(f"{printable(out, 200)} is not a folder; choose another output")
-    if not out.parent.is_dir():
-        raise OutputError(f"the folder {printable(out.parent, 200)} does not exist; make it first")
     with _files.reported(out):
-        out.mkdir(exist_ok=True)
+        out.mkdir(parents=True, exist_ok=True)
         foreign = {entry.name for entry in out.iterdir()} - {layout.STATE}
         known = any((out / own).exists() for own in (layout.CONTENTS, layout.JOURNAL))
         if foreign and not known:

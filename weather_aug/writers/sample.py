@@ -11,18 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug import _files
+from weather_aug._png import png_bytes
 from weather_aug.clip.types import FrameKey
 from weather_aug.errors import SceneError, printable
 from weather_aug.render.compose import RenderedFrame, RenderOptions
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.taxonomy import CLASSES
 from weather_aug.weather import Weather
-from weather_aug.writers import png
 from weather_aug.writers.plan import ExportPlan
 
 
 def render_recipe(scene: WeatherScene, recipe: Mapping[str, Any]) -> RenderedFrame:
-    """Render the sample that a recipe of the manifest describes.
+    """Render the sample that a recipe of an export's manifest or of a data set describes.
+
+    A recipe's `window`, (top, left, height, width) in pixels, may be null or absent: the whole
+    picture.
 
     Raises:
         SceneError: If the scene is not the recipe's, or a file of it cannot be read.
@@ -33,19 +36,21 @@ def render_recipe(scene: WeatherScene, recipe: Mapping[str, Any]) -> RenderedFra
             f"{scene.digest[:12]}…, the recipe's {printable(recipe['scene_digest'], 12)}"
         )
     key = FrameKey(recipe["time_index"], recipe["camera"])
+    window = recipe.get("window")
     return scene.render(
         key,
         Weather.from_dict(recipe["weather"]),
         seed=recipe["seed"],
+        window=None if window is None else tuple(window),
         options=RenderOptions(**recipe["options"]),
     )
 
 
 def encoded_parts(shot: RenderedFrame) -> dict[str, bytes]:
     """PNG bytes of each part: `image`, and `label` where the frame is labelled."""
-    parts = {"image": png.encode(shot.image)}
+    parts = {"image": png_bytes(shot.image)}
     if shot.label is not None:
-        parts["label"] = png.encode(shot.label)
+        parts["label"] = png_bytes(shot.label)
     return parts
 
 

@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from weather_aug import taxonomy
 from weather_aug.clip.folder import FolderClip
 from weather_aug.clip.labelled import LabelledClip
 from weather_aug.clip.open import open_clip
@@ -55,7 +56,14 @@ def test_camvid_opens_by_its_address() -> None:
 def test_depth_prior_agrees_with_the_camera(tmp_path: Path) -> None:
     _picture(tmp_path / "images" / "a.png")
     _labels(tmp_path / "labels" / "a.png")
-    clip = FolderClip(tmp_path, images="images", labels="labels", pitch_deg=4.0, height_m=2.0)
+    clip = FolderClip(
+        tmp_path,
+        images="images",
+        labels="labels",
+        taxonomy="train_ids",
+        pitch_deg=4.0,
+        height_m=2.0,
+    )
     frame = clip.frame(clip.keys[0])
     assert frame.depth_m is not None
     ray = np.linalg.inv(frame.camera.intrinsics) @ np.array([11.0, 28.0, 1.0])
@@ -92,18 +100,53 @@ def test_acdc_endings_pair(tmp_path: Path) -> None:
     np.testing.assert_array_equal(_label(), clip.frame(clip.keys[0]).label)
 
 
+def test_the_ending_of_the_label_files_tells_their_taxonomy(tmp_path: Path) -> None:
+    """Read as train ids, Cityscapes' 7 (road) would be a traffic sign."""
+    _picture(tmp_path / "images" / "a_leftImg8bit.png")
+    ids = np.full((HEIGHT, WIDTH), 7, np.uint8)
+    _labels(tmp_path / "labels" / "a_gtFine_labelIds.png", ids)
+    clip = FolderClip(tmp_path, images="images", labels="labels")
+    np.testing.assert_array_equal(ROAD, clip.frame(clip.keys[0]).label)
+    _labels(tmp_path / "labels" / "a_gtFine_labelTrainIds.png")
+    both = FolderClip(tmp_path, images="images", labels="labels")
+    np.testing.assert_array_equal(_label(), both.frame(both.keys[0]).label)
+
+
+def test_label_files_that_do_not_tell_need_a_taxonomy(tmp_path: Path) -> None:
+    _picture(tmp_path / "images" / "a.png")
+    _labels(tmp_path / "labels" / "a.png")
+    with pytest.raises(ArgumentError, match=r"labels do not say.*taxonomy=") as caught:
+        FolderClip(tmp_path, images="images", labels="labels")
+    assert all(name in str(caught.value) for name in taxonomy._TAXONOMIES)
+    for name in taxonomy._TAXONOMIES:
+        assert FolderClip(tmp_path, images="images", labels="labels", taxonomy=name).keys
+    with pytest.raises(ClipError, match="nowhere does not exist"):
+        FolderClip(tmp_path, images="images", labels="nowhere")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ClipError, match=r"empty holds no \.png"):
+        FolderClip(tmp_path, images="images", labels="empty")
+
+
+def test_pictures_are_a_drive_only_at_a_speed(tmp_path: Path) -> None:
+    _picture(tmp_path / "a.png")
+    assert not FolderClip(tmp_path).is_drive
+    assert FolderClip(tmp_path, speed_m_per_s=8.0).is_drive
+    assert FolderClip(tmp_path, speed_m_per_s=0.0).is_drive
+    assert open_clip(f"folder:{tmp_path}?speed_m_per_s=4").is_drive  # type: ignore[attr-defined]
+
+
 def test_a_picture_without_its_label_is_named(tmp_path: Path) -> None:
     for name in ("a", "b"):
         _picture(tmp_path / "images" / f"{name}.png")
     _labels(tmp_path / "labels" / "a.png")
     with pytest.raises(ClipError, match=r"images/b\.png has no label in .*labels \(1 of 2"):
-        FolderClip(tmp_path, images="images", labels="labels")
+        FolderClip(tmp_path, images="images", labels="labels", taxonomy="train_ids")
 
 
 def test_a_label_of_another_size_names_both_files(tmp_path: Path) -> None:
     _picture(tmp_path / "images" / "a.png", (WIDTH, HEIGHT + 1))
     _labels(tmp_path / "labels" / "a.png")
-    clip = FolderClip(tmp_path, images="images", labels="labels")
+    clip = FolderClip(tmp_path, images="images", labels="labels", taxonomy="train_ids")
     with pytest.raises(ClipError, match=r"labels/a\.png is 40x30, .*images/a\.png is 40x31"):
         clip.frame(clip.keys[0])
 
@@ -111,7 +154,7 @@ def test_a_label_of_another_size_names_both_files(tmp_path: Path) -> None:
 def test_unknown_ids_name_the_file(tmp_path: Path) -> None:
     _picture(tmp_path / "images" / "a.png")
     _labels(tmp_path / "labels" / "a.png", np.full((HEIGHT, WIDTH), 77, np.uint8))
-    clip = FolderClip(tmp_path, images="images", labels="labels")
+    clip = FolderClip(tmp_path, images="images", labels="labels", taxonomy="train_ids")
     with pytest.raises(DataError, match=r"labels/a\.png: label id 77"):
         clip.frame(clip.keys[0])
 
@@ -134,7 +177,9 @@ def test_depth_png_is_read_in_kitti_units_and_completed(tmp_path: Path) -> None:
     steps[20:24, 10:20] = 0
     (tmp_path / "depth").mkdir()
     Image.fromarray(steps).save(tmp_path / "depth" / "a.png")
-    clip = FolderClip(tmp_path, images="images", labels="labels", depth="depth")
+    clip = FolderClip(
+        tmp_path, images="images", labels="labels", taxonomy="train_ids", depth="depth"
+    )
     depth = clip.frame(clip.keys[0]).depth_m
     assert depth is not None
     np.testing.assert_array_equal(np.isinf(depth), _label() == SKY)
@@ -179,8 +224,8 @@ def test_bad_depth_files_are_named(
 def test_scale_shrinks_all_together(tmp_path: Path) -> None:
     _picture(tmp_path / "images" / "a.png")
     _labels(tmp_path / "labels" / "a.png")
-    whole = FolderClip(tmp_path, images="images", labels="labels")
-    half = FolderClip(tmp_path, images="images", labels="labels", scale=0.5)
+    whole = FolderClip(tmp_path, images="images", labels="labels", taxonomy="train_ids")
+    half = FolderClip(tmp_path, images="images", labels="labels", taxonomy="train_ids", scale=0.5)
     big, small = whole.frame(whole.keys[0]), half.frame(half.keys[0])
     assert small.image.shape == (15, 20, 3)
     assert small.label is not None and small.depth_m is not None and big.depth_m is not None
@@ -193,7 +238,7 @@ def test_scale_shrinks_all_together(tmp_path: Path) -> None:
 def test_frames_are_read_only_and_repeat(tmp_path: Path) -> None:
     _picture(tmp_path / "images" / "a.png")
     _labels(tmp_path / "labels" / "a.png")
-    clip = FolderClip(tmp_path, images="images", labels="labels")
+    clip = FolderClip(tmp_path, images="images", labels="labels", taxonomy="train_ids")
     first, second = clip.frame(clip.keys[0]), clip.frame(clip.keys[0])
     for name in ("image", "label", "depth_m"):
         with pytest.raises(ValueError, match="read-only"):
@@ -211,7 +256,7 @@ def test_a_teacher_labels_what_has_none(tmp_path: Path) -> None:
 def test_a_teacher_leaves_labels_and_pictures_alone(tmp_path: Path) -> None:
     _picture(tmp_path / "images" / "a.png")
     _labels(tmp_path / "labels" / "a.png")
-    labelled = FolderClip(tmp_path, images="images", labels="labels")
+    labelled = FolderClip(tmp_path, images="images", labels="labels", taxonomy="train_ids")
     clip = LabelledClip(labelled, lambda image: np.zeros(image.shape[:2], np.uint8))
     np.testing.assert_array_equal(_label(), clip.frame(clip.keys[0]).label)
 

@@ -4,7 +4,8 @@ Convention:
     Every picture is a time step of one camera, "front", that stands `height_m` above flat ground
     and looks along it. The world is right-handed with x right, y down, z forward and its origin on
     the ground below the first picture's camera. Nothing is known about the motion: the camera
-    stands still unless `speed_m_per_s` moves it forward.
+    stands still, and the pictures count as unrelated, each in its own light, unless
+    `speed_m_per_s` says that they are a drive.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from weather_aug.clip.records import (
 )
 from weather_aug.clip.sky import sky_mask
 from weather_aug.clip.types import Camera, Frame, FrameKey, check_key
-from weather_aug.errors import ClipError, printable
+from weather_aug.errors import ArgumentError, ClipError, printable
 from weather_aug.taxonomy import SKY
 from weather_aug.taxonomy import taxonomy as taxonomy_called
 
@@ -46,6 +47,8 @@ MIN_DEPTH_M, MAX_DEPTH_M = 0.1, 1000.0
 
 _PICTURES = (".png", ".jpg", ".jpeg")
 _IMAGE_ENDINGS = ("_leftImg8bit", "_rgb_anon", "_rgb_ref_anon")
+TAXONOMIES = ("train_ids", "cityscapes", "camvid11")
+"""What `taxonomy=` accepts."""
 _LABEL_ENDINGS_BY_TAXONOMY = {
     "cityscapes": ("_gtFine_labelIds", "_gtCoarse_labelIds", "_gt_labelIds"),
     "train_ids": ("_gtFine_labelTrainIds", "_gtCoarse_labelTrainIds", "_gt_labelTrainIds"),
@@ -79,19 +82,22 @@ class FolderClip:
         images: Folder of the pictures, searched with its subfolders.
         labels: Folder of label PNGs, or None.
         depth: Folder of depth files, or None.
-        taxonomy: What the label ids mean, see `weather_aug.taxonomy`.
+        taxonomy: What the label ids mean, see `weather_aug.taxonomy`. None takes it from the ending
+            of the label files: "train_ids" of `labelTrainIds`, "cityscapes" of `labelIds`.
         frames: Which pictures to offer, by their order; None for all.
         scale: Everything is scaled down by this factor, in (0, 1].
         height_m: Height of the camera over the ground, metres.
         hfov_deg: Horizontal field of view, degrees; not used where `focal_px` is given.
         focal_px: Focal length in pixels of the unscaled picture, or None.
         pitch_deg: How far the camera looks down, degrees.
-        speed_m_per_s: Forward speed of the camera.
+        speed_m_per_s: Forward speed of the camera that took the pictures one after another; None if
+            they are unrelated.
         fps: Pictures a second.
 
     Raises:
         ClipError: If a folder is missing or empty, or a picture has no label or depth file.
-        ArgumentError: If an option is outside what is accepted.
+        ArgumentError: If an option is outside what is accepted, or labels whose file names do not
+            say what their ids mean are given without a taxonomy.
     """
 
     def __init__(
@@ -101,23 +107,27 @@ class FolderClip:
         images: str = ".",
         labels: str | None = None,
         depth: str | None = None,
-        taxonomy: str = "train_ids",
+        taxonomy: str | None = None,
         frames: slice | None = None,
         scale: float = 1.0,
         height_m: float = 1.5,
         hfov_deg: float = 60.0,
         focal_px: float | None = None,
         pitch_deg: float = 0.0,
-        speed_m_per_s: float = 0.0,
+        speed_m_per_s: float | None = None,
         fps: float = 10.0,
     ) -> None:
         top = folder_at(root, "image folder")
-        self._taxonomy = taxonomy_called(taxonomy)
+        if taxonomy is None and labels is not None:
+            taxonomy = _taxonomy_of(top / labels)
+        self._taxonomy = None if taxonomy is None else taxonomy_called(taxonomy)
         self._scale = checked_scale(scale)
         self._height_m = finite("height_m", height_m, 0.1, 100.0)
         self._hfov_rad = math.radians(finite("hfov_deg", hfov_deg, 5.0, 150.0))
         self._focal_px = None if focal_px is None else finite("focal_px", focal_px, 10.0, 1e5)
         self._pitch_rad = math.radians(finite("pitch_deg", pitch_deg, -30.0, 30.0))
+        self.is_drive = speed_m_per_s is not None
+        speed_m_per_s = 0.0 if speed_m_per_s is None else speed_m_per_s
         self._speed_m_per_s = finite("speed_m_per_s", speed_m_per_s, -100.0, 100.0)
         self._fps = finite("fps", fps, 1e-3, 1e4)
         self.name = folder_name("folder", top.resolve().name, "" if images == "." else images)
@@ -129,7 +139,7 @@ class FolderClip:
         self._images = [picture_paths[stem] for stem in stems]
         self._labels = self._depths = None
         if labels is not None:
-            endings = _LABEL_ENDINGS_BY_TAXONOMY.get(taxonomy, ())
+            endings = _LABEL_ENDINGS_BY_TAXONOMY.get(taxonomy or "", ())
             known = [e for group in _LABEL_ENDINGS_BY_TAXONOMY.values() for e in group]
             others = {*known, *_OTHER_ENDINGS} - set(endings)
             found = _by_stem(top / labels, (".png",), endings, (), skip=tuple(others))
@@ -177,6 +187,7 @@ class FolderClip:
     def _label(self, path: Path, index: int, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         ids = read_label(path)
         _like_picture(path, ids.shape, self._images[index], image)
+        assert self._taxonomy is not None, "labels have a taxonomy"
         return self._taxonomy.train_ids(ids, where=shown(path))
 
     def _depth(
@@ -250,6 +261,21 @@ def _whole_depth(
     filled = sharpened(filled, min_jump=depth_jump(focal_px))
     depth = np.where(known, metres, 1 / np.clip(filled, 1 / MAX_DEPTH_M, 1 / MIN_DEPTH_M))
     return np.where(sky, np.inf, np.maximum(depth, MIN_DEPTH_M)).astype(np.float32)
+
+
+def _taxonomy_of(folder: Path) -> str:
+    """The taxonomy that the endings of the label files tell; train ids where there are both."""
+    files = folder_at(folder, "folder").rglob("*")
+    stems = [path.stem for path in files if path.suffix.lower() == ".png"]
+    for name in ("train_ids", "cityscapes"):
+        if any(stem.endswith(_LABEL_ENDINGS_BY_TAXONOMY[name]) for stem in stems):
+            return name
+    if not stems:
+        raise ClipError(f"{shown(folder)} holds no .png files; check the path")
+    raise ArgumentError(
+        f"the file names in {shown(folder)} do not say what the label ids mean; choose "
+        f"taxonomy= from {', '.join(TAXONOMIES)}"
+    )
 
 
 def _by_stem(

@@ -34,7 +34,7 @@ def optical_depth(z, ray, up, fog, inverse_height, haze, precipitation, resolved
     sine = rise / norm
     path = np.where(np.isinf(z), np.minimum(1000 / np.maximum(sine, 0.05), 20000), z * norm)
     z = path / norm
-    h = np.clip(path * sine * inverse_height, -8, 80)
+    h = np.maximum(path * sine * inverse_height, -8)
     share = np.where(np.abs(h) < 1e-3, 1 - h / 2, -np.expm1(-h) / np.where(h == 0, 1, h))
     air = (fog * share + haze) * path
     return np.minimum(air + np.maximum(precipitation * z - resolved(z), 0) * norm, 60)

@@ -159,6 +159,96 @@ def test_two_cameras_see_the_same_particles():
     assert np.mean(distance < 1e-5) > 0.99
 
 
+@pytest.mark.parametrize(("rate", "reference"), [(2.5, 17_000), (10.0, 68_000), (50.0, 308_000)])
+def test_drops_that_a_driving_camera_resolves(rate, reference):
+    """KITTI's camera at 10 m/s, counted before by integrating over the mean image streak."""
+    cam = camera(speed=10.0, width=1242, height=375, exposure_s=0.002)
+    focal = np.diag([721.0, 721.0, 1.0]) + np.array([[0, 0, 621], [0, 0, 187], [0, 0, 0.0]])
+    cam = replace(cam, intrinsics=focal)
+    resolved = field(statistics.rain(rate)).resolve(cam, 500_000)
+    assert resolved.alpha_min == 0.01
+    assert 0.5 * reference < resolved.expected_count < 1.6 * reference
+
+
+def test_motion_along_the_view_hides_no_drops():
+    """Twice the speed towards drops must not cost most of them, as twice the streak would."""
+    still, fast = (
+        field(statistics.rain(20.0)).resolve(camera(speed=v, exposure_s=0.005), 500_000)
+        for v in (0.0, 15.0)
+    )
+    assert fast.expected_count > 0.2 * still.expected_count
+
+
+def test_wind_given_as_drift_changes_streaks_but_no_place():
+    """The same air under another wind: a severity sweep adds drops and moves none."""
+    cam = camera()
+    drift = np.array([1.0, 2.0, 0.0])
+    calm, storm = (
+        ParticleField(statistics.rain(20.0), 1, np.array(wind), AXES, drift)
+        for wind in ((0.0, 0.0, 0.0), (0.0, 9.0, 0.0))
+    )
+    resolved = calm.resolve(cam, 5_000)
+    before = calm.particles(cam, 7.0, resolved, whole(cam))
+    after = storm.particles(cam, 7.0, resolved, whole(cam))
+    places = {tuple(row) for row in np.round(after[:, :3], 5)}
+    assert np.mean([tuple(row) in places for row in np.round(before[:, :3], 5)]) == 1.0
+    assert not np.array_equal(before[:, 3:6], after[: len(before), 3:6])
+
+
+def test_drift_is_wind_times_time_where_it_is_not_given():
+    cam, wind = camera(), np.array([0.5, 1.5, 0.0])
+    plain = field(statistics.rain(20.0), wind=wind)
+    given = replace(plain, drift_world_m=wind * 4.0)
+    resolved = plain.resolve(cam, 5_000)
+    np.testing.assert_array_equal(
+        plain.particles(cam, 4.0, resolved, whole(cam)),
+        given.particles(cam, 4.0, resolved, whole(cam)),
+    )
+
+
+def test_swaying_flakes_move_with_the_velocity_they_report():
+    this, cam = field(statistics.snow(2.0), wind=(0.4, 0.2, 0.0)), camera()
+    resolved = this.resolve(cam, 5_000)
+    before = this.particles(cam, 3.0, resolved, whole(cam))
+    after = this.particles(cam, 3.02, resolved, whole(cam))
+    moved = before[:, :3] + 0.02 * before[:, 3:6]
+    distance = np.linalg.norm(moved[:, None] - after[None, :, :3], axis=-1).min(axis=1)
+    stays = inside(before, cam) & (before[:, 2] > 1) & (before[:, 2] < 4)
+    assert stays.sum() > 20
+    # The sine's table has steps of 0.4 mm.
+    assert np.quantile(distance[stays], 0.9) < 1.5e-3
+
+
+def test_kinds_are_different_fields():
+    """Snow is not rain's places with other sizes."""
+    cam = camera()
+    rain = field(statistics.rain(20.0))
+    other = field(replace(statistics.rain(20.0), kind="snow"))
+    resolved = rain.resolve(cam, 5_000)
+    first, second = (f.particles(cam, 0.0, resolved, whole(cam)) for f in (rain, other))
+    assert not {tuple(r) for r in first[:, :3]} & {tuple(r) for r in second[:, :3]}
+
+
+def test_rare_particles_are_as_rare_as_they_should_be():
+    """Cubes that hold 1e-4 particles on average: the first arrival is drawn finely enough."""
+    population = statistics.rain(100.0)
+    thin = replace(population, density_per_m3=np.full(14, 1e-4) / population.cell_m**3)
+    cam = camera(width=600, height=600)
+    counts = []
+    reach = np.zeros((14, 16), np.float32)
+    reach[13] = 60.0
+    for seed in range(25):
+        resolved = replace(field(population).resolve(cam, 10), reach_m=reach)
+        counts.append(
+            inside(field(thin, seed).particles(cam, 0.0, resolved, whole(cam)), cam).sum()
+        )
+    (fx, fy) = cam.focal_px
+    volume = 600 * 600 / (fx * fy) * (60.0**3 - NEAR_M**3) / 3
+    expected = 25 * volume * thin.density_per_m3[13]
+    assert expected > 20
+    assert abs(np.sum(counts) - expected) < 4 * np.sqrt(expected)
+
+
 def test_higher_rain_rates_add_drops_and_move_none():
     cam = camera()
     light, heavy = field(statistics.rain(5.0)), field(statistics.rain(60.0))

@@ -64,6 +64,20 @@ def test_height_fog_is_the_integral_along_the_ray(scale_height_m, ambience):
         assert shot.transmittance[v, u] == pytest.approx(expected, rel=2e-4)
 
 
+@pytest.mark.parametrize("scale_height_m", [1.0, 3.0, 10.0, 25.0])
+def test_sky_above_height_fog_shines_through(scale_height_m, ambience):
+    """A thin layer has a top: the optical depth of the sky is beta H over the sine of elevation."""
+    camera = make_camera(width=60, height=40)
+    weather = Weather(visibility_m=150.0, fog_scale_height_m=scale_height_m)
+    shot = render(make_frame(camera, 200, np.inf), weather, seed=0, ambience=ambience)
+    x, y = rays(camera)[0, 30]
+    sine = -y / np.sqrt(1 + x * x + y * y)
+    path = min(1000 / sine, 20000)
+    thinning = 1 - np.exp(-path * sine / scale_height_m)
+    expected = np.exp(-weather.fog_per_m * scale_height_m / sine * thinning)
+    assert shot.transmittance[0, 30] == pytest.approx(expected, rel=1e-3)
+
+
 def test_air_matches_the_reference(ambience):
     rng = np.random.default_rng(3)
     camera = make_camera()

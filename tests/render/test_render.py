@@ -1,5 +1,7 @@
 """render(): its contract, whatever the weather."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -102,6 +104,63 @@ def test_a_window_is_a_part_of_the_whole(kind, severity, seed, window):
     for name in ("image", "label", "label_full", "invalid", "transmittance", "depth"):
         expected = getattr(whole, name)[top : top + height, left : left + width]
         np.testing.assert_array_equal(expected, getattr(part, name))
+
+
+def test_a_window_of_an_unlabelled_frame_is_a_part_of_the_whole():
+    """There the sky is found from depth, which looks at more neighbours."""
+    rng = np.random.default_rng(0)
+    camera = make_camera(60, 40)
+    for seed in range(20):
+        depth = np.where(rng.random((40, 60)) < 0.02, np.inf, rng.uniform(20, 90, (40, 60)))
+        level = np.full((40, 60, 3), 196, np.uint8)
+        frame = make_frame(camera, level, depth)
+        weather = Weather.fog("moderate")
+        whole = render(frame, weather, seed=seed, ambience=AMBIENCE)
+        part = render(frame, weather, seed=seed, ambience=AMBIENCE, window=(9, 13, 20, 30))
+        np.testing.assert_array_equal(whole.invalid[9:29, 13:43], part.invalid)
+        np.testing.assert_array_equal(whole.image[9:29, 13:43], part.image)
+
+
+def test_a_window_of_a_turning_camera_is_a_part_of_the_whole():
+    frame = street_frame()
+    camera = replace(
+        frame.camera,
+        exposure_s=0.03,
+        angular_velocity_rad_per_s=np.array([0.3, -1.0, 0.2]),
+        velocity_m_per_s=np.array([25.0, 1.0, 0.0]),
+    )
+    frame = replace(frame, camera=camera)
+    for weather in (Weather.rain("extreme"), Weather.snow("extreme")):
+        whole = render(frame, weather, seed=2, ambience=AMBIENCE)
+        for window in ((0, 0, 20, 20), (30, 60, 31, 37), (10, 5, 3, 90)):
+            top, left, height, width = window
+            part = render(frame, weather, seed=2, ambience=AMBIENCE, window=window)
+            expected = whole.transmittance[top : top + height, left : left + width]
+            np.testing.assert_array_equal(expected, part.transmittance)
+
+
+def test_a_severity_sweep_at_equal_drift_keeps_its_drops():
+    """Heavier rain with the wind that comes with it: at equal drift nothing is drawn anew."""
+    frame = street_frame(time_s=9.0)
+
+    def drops(severity, drift_m):
+        weather = replace(Weather.rain(severity), mist_per_km=0.0)
+        through = [
+            render(
+                frame,
+                weather,
+                seed=2,
+                ambience=AMBIENCE,
+                drift_m=drift_m,
+                options=RenderOptions(budget),
+            ).transmittance
+            for budget in (0, 2_000)
+        ]
+        return np.log(through[0] / through[1])
+
+    still = (0.0, 0.0, 0.0)
+    first, kept, anew = drops(0.75, still), drops(0.76, still), drops(0.76, None)
+    assert np.abs(kept - first).mean() < 0.5 * np.abs(anew - first).mean()
 
 
 def test_a_frame_alone_is_the_frame_in_sequence():

@@ -23,6 +23,8 @@ from weather_aug.errors import CalibrationError, ClipError, DataError, printable
 Float64 = NDArray[np.float64]
 
 RIGID_TOLERANCE = 1e-4
+MAX_SPEED_M_PER_S = 150.0
+MAX_TURNING_RAD_PER_S = 6.0
 
 
 class FrameKey(NamedTuple):
@@ -40,8 +42,8 @@ class Camera:
     """A calibrated pinhole camera at one moment; see the module's Convention.
 
     Raises:
-        CalibrationError: If the intrinsics are singular, the focal length is not positive, or the
-            pose is not a finite rigid motion (to 1e-4).
+        CalibrationError: If the intrinsics are singular, the focal length is not positive, the pose
+            is not a finite rigid motion (to 1e-4), or the motion is faster than a car's.
     """
 
     intrinsics: Float64
@@ -68,6 +70,13 @@ class Camera:
             raise CalibrationError(f"exposure_s must be in (0, 1] s, got {self.exposure_s!r}")
         if not (np.isfinite(self.aperture_m) and 0 <= self.aperture_m <= 0.1):
             raise CalibrationError(f"aperture_m must be in [0, 0.1] m, got {self.aperture_m!r}")
+        speed = float(np.linalg.norm(self.velocity_m_per_s))
+        turning = float(np.linalg.norm(self.angular_velocity_rad_per_s))
+        if speed > MAX_SPEED_M_PER_S or turning > MAX_TURNING_RAD_PER_S:
+            raise CalibrationError(
+                f"the camera moves at {speed:.3g} m/s and turns at {turning:.3g} rad/s, as no car "
+                "does; look for a jump in the poses or times"
+            )
         _check_intrinsics(self.intrinsics)
         _check_rigid("world_from_camera", self.world_from_camera)
 
@@ -166,6 +175,9 @@ class Clip(Protocol):
         `keys` is ordered by time, then by camera. `frame` reads from disk each time and keeps
         nothing; two calls give equal frames. A clip holds paths and small tables only, so that it
         can be pickled to a worker.
+
+        A clip of unrelated pictures, each in its own light, says so by an attribute
+        `is_drive = False`; without the attribute a clip is a drive, under one light.
     """
 
     @property

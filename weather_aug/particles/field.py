@@ -44,6 +44,8 @@ class ParticleField:
     """(3,)."""
     axes_world: Float64
     """(3, 3), rows: along the street, to the left, up."""
+    drift_world_m: Float64 | None = None
+    """(3,) how far the wind has carried the air since time 0; wind times time if None."""
 
     @property
     def velocity_world_m_per_s(self) -> Float64:
@@ -55,8 +57,8 @@ class ParticleField:
     def resolve(self, camera: Camera, max_particles: int) -> Resolved:
         """What `camera` resolves of this field within a budget; see `resolve.resolve`."""
         relative = self.velocity_world_m_per_s - camera.velocity_m_per_s
-        streak_m = np.linalg.norm(relative, axis=1) * camera.exposure_s
-        return resolve(self.population, camera, streak_m, max_particles)
+        across = _across_picture(camera, relative @ camera.world_from_camera[:3, :3])
+        return resolve(self.population, camera, across * camera.exposure_s, max_particles)
 
     def particles(
         self, camera: Camera, time_s: float, resolved: Resolved, window: Window
@@ -80,7 +82,7 @@ class ParticleField:
             _class_keys(population.kind, self.seed, len(pad_m)),
             population.density_per_m3 * population.cell_m**3,
             population.cell_m,
-            camera.centre_world - velocity * time_s,
+            camera.centre_world - self._carried_m(time_s),
             resolved.reach_m,
             *_planes_and_bounds(rotation, view, resolved.reach_m, pad_m),
             _EXPONENTIAL,
@@ -103,6 +105,28 @@ class ParticleField:
             if found <= capacity:
                 return particles[:found]
             capacity = found
+
+    def _carried_m(self, time_s: float) -> Float64:
+        """(C, 3) displacement of each class since time 0, world axes."""
+        carried: Float64 = self.velocity_world_m_per_s * time_s
+        if self.drift_world_m is not None:
+            carried = carried + (self.drift_world_m - self.wind_world_m_per_s * time_s)
+        return carried
+
+
+def _across_picture(camera: Camera, relative: Float64) -> Float64:
+    """Speed (C,) across the line of sight, m/s, averaged over the picture.
+
+    `relative` is (C, 3), in camera axes. Motion along the line of sight draws no streak: from a
+    moving car the speed across is much less than the speed. The camera's own turning is left out,
+    because its share grows with depth.
+    """
+    (fx, fy), (cx, cy) = camera.focal_px, camera.principal_px
+    tx = (np.linspace(0, camera.width, 7) - cx) / fx
+    ty = (np.linspace(0, camera.height, 7) - cy) / fy
+    across_x = relative[:, 0, None, None] - tx[:, None] * relative[:, 2, None, None]
+    across_y = relative[:, 1, None, None] - ty[None, :] * relative[:, 2, None, None]
+    return np.asarray(np.hypot(across_x, across_y).mean(axis=(1, 2)))
 
 
 @lru_cache(maxsize=256)
@@ -130,10 +154,18 @@ def _padded_view(
         ]
     )
     speed = np.linalg.norm(relative, axis=1) + population.sway_m * sum(SWAY_RAD_PER_S)
-    turning = np.linalg.norm(camera.angular_velocity_rad_per_s) * reach_m.max(axis=1)
-    streak_m = (speed + turning) * camera.exposure_s * (1.0 + np.abs(view).max())
-    pad_m = streak_m + 2 * camera.aperture_m + 2 * population.diameters_m.max(axis=1)
-    return view, pad_m
+    still_m = 2 * camera.aperture_m + 2 * population.diameters_m.max(axis=1)
+    still_m += np.sqrt(2) * population.sway_m
+    # A padded particle is seen at a steeper angle than the view's own, which lengthens its streak:
+    # once round settles it.
+    widest = np.abs(view).max()
+    for _ in range(2):
+        steepness = np.hypot(1.0, np.sqrt(2) * widest)
+        turning = np.linalg.norm(camera.angular_velocity_rad_per_s) * reach_m.max(axis=1)
+        streak_m = (speed + turning * steepness) * camera.exposure_s * (1.0 + widest)
+        pad_m = streak_m + still_m
+        widest = np.minimum(np.abs(view).max() + pad_m / NEAR_M, np.abs(view).max() + 1.0)
+    return view, np.asarray(pad_m)
 
 
 def _planes_and_bounds(
@@ -159,9 +191,10 @@ def _planes_and_bounds(
 
 
 def _quantiles_of_exponential() -> Float32:
-    """Mid-quantiles of the unit exponential, scaled to the mean 1 that truncation lowers."""
-    quantiles = -np.log1p(-(np.arange(4096) + 0.5) / 4096)
-    return (quantiles / quantiles.mean()).astype(np.float32)
+    """Quantiles (4097,) of the unit exponential to interpolate in, scaled to the mean 1."""
+    quantiles = -np.log1p(-np.minimum(np.arange(4097), 4095.5) / 4096)
+    mean = 0.5 * (quantiles[:-1] + quantiles[1:]).mean()
+    return (quantiles / mean).astype(np.float32)
 
 
 _EXPONENTIAL = _quantiles_of_exponential()

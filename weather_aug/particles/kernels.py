@@ -180,7 +180,7 @@ def scatter(
         planes: (C, 6, 4) planes of the padded view, world axes about the camera: normals point
             inwards, the offset holds the padding.
         bounds: (C, 2, 3) box around the padded view, world axes about the camera, metres.
-        exponential: (4096,) quantiles of the unit exponential.
+        exponential: (4097,) quantiles of the unit exponential.
         sway_m: Amplitude of the sway.
         sway_turns: (C, 2) turns of the sway at this time.
         sway_axes: (2, 3) horizontal unit vectors, world axes.
@@ -235,7 +235,10 @@ def scatter(
                     while True:
                         slot += np.uint64(1)
                         word = mix64(key + slot * GOLDEN)
-                        level += exponential[word & np.uint64(4095)]
+                        step = np.int64(word & np.uint64(4095))
+                        part = np.float64(word >> np.uint64(52)) * (1.0 / 4096.0)
+                        below = np.float64(exponential[step])
+                        level += below + part * (np.float64(exponential[step + 1]) - below)
                         if level > mean:
                             break
                         place = mix64(word)

@@ -23,6 +23,8 @@ RAIN_EDGES_MM = np.array(
 SNOW_EDGES_MM = np.array([0.5, 0.6, 0.72, 0.86, 1.02, 1.2, 1.4, 1.62, 1.86, 2.15, 2.5, 2.9, 3.37])
 """Speed classes of flakes, by melted diameter; 3.37 mm melted is a flake of 15 mm."""
 SIZES_PER_CLASS = 16
+TRACE_MM_PER_H = 1e-4
+"""Rates up to this are nothing: a kilometre of it takes a four-thousandth of the light."""
 
 MARSHALL_PALMER_PER_M3_MM = 8000.0
 FLAKE_DENSITY_G_PER_CM3_MM = 0.17

@@ -26,7 +26,7 @@ from weather_aug.render.medium import Medium, Optics
 from weather_aug.render.project import BAND_ROWS, order_by_band, project
 from weather_aug.render.shade import Tone, shade
 from weather_aug.taxonomy import SKY
-from weather_aug.weather import Weather
+from weather_aug.weather import Weather, Wind
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -77,6 +77,7 @@ def render(
     seed: int,
     ambience: Ambience,
     window: Window | None = None,
+    drift_m: Wind | None = None,
     options: RenderOptions = DEFAULT_OPTIONS,
 ) -> RenderedFrame:
     """Render `frame` in `weather`: a pure function of its arguments.
@@ -84,10 +85,14 @@ def render(
     Args:
         frame: Picture with depth; a label decides where the sky is, else the depth does.
         weather: State of air and ground.
-        seed: Which particles fall; equal seeds show equal particles at any severity.
+        seed: Which particles fall. At equal drift a higher rain rate adds drops to those already
+            there; of snow small flakes become fewer and large ones more.
         ambience: Light and axes of the scene.
         window: (top, left, height, width) to render, the whole picture if None; a window's pixels
             equal the same pixels of the whole.
+        drift_m: How far the wind has carried the air since time 0 (along the street, to its left,
+            up); wind times time if None. Give it to compare weathers of different wind, or where
+            the wind changed on the way.
         options: Budget.
 
     Raises:
@@ -108,11 +113,14 @@ def render(
     window = checked_window(window, height, width)
     if weather.is_clear:
         return _clear(frame, window)
-    outer = _with_margin(window, NEIGHBOURHOOD_PX // 2, height, width)
+    # Labels look around themselves, and so does the sky where only depth tells of it.
+    looks = 1 if frame.label is not None else 2
+    outer = _with_margin(window, looks * (NEIGHBOURHOOD_PX // 2), height, width)
     image, label, depth = _cut(frame, outer)
     sky = _sky_by_depth(depth) if label is None else label == SKY
-    fields = _fields(weather, seed, ambience)
-    resolved = [field.resolve(frame.camera, options.max_particles) for field in fields]
+    fields = _fields(weather, seed, ambience, drift_m)
+    budget = options.max_particles // max(len(fields), 1)
+    resolved = [field.resolve(frame.camera, budget) for field in fields]
     shot = _shade(frame, weather, ambience, outer, fields, resolved, image, depth, sky)
     return _trimmed(shot, label, depth, outer, window)
 
@@ -207,15 +215,18 @@ def _with_margin(window: Window, margin: int, height: int, width: int) -> Window
     return (first, start, end - first, stop - start)
 
 
-def _fields(weather: Weather, seed: int, ambience: Ambience) -> list[ParticleField]:
+def _fields(
+    weather: Weather, seed: int, ambience: Ambience, drift_m: Wind | None = None
+) -> list[ParticleField]:
     axes = ambience.axes_world
     wind = np.asarray(weather.wind_m_per_s) @ axes
+    drift = None if drift_m is None else np.asarray(drift_m, np.float64) @ axes
     populations = []
-    if weather.rain_mm_per_h > 0:
+    if weather.rain_mm_per_h > statistics.TRACE_MM_PER_H:
         populations.append(statistics.rain(weather.rain_mm_per_h))
-    if weather.snow_mm_per_h > 0:
+    if weather.snow_mm_per_h > statistics.TRACE_MM_PER_H:
         populations.append(statistics.snow(weather.snow_mm_per_h))
-    return [ParticleField(population, seed, wind, axes) for population in populations]
+    return [ParticleField(population, seed, wind, axes, drift) for population in populations]
 
 
 def _optics(camera: Camera, up_world: Float64) -> Optics:
@@ -310,18 +321,18 @@ def _splats(
     medium: Medium,
     carried: Float32,
 ) -> Float32:
-    """(N, 12) screen-space particles of all fields that touch the window."""
+    """(N, 13) screen-space particles of all fields that touch the window."""
     light = ambience.under(weather.overcast)
     airlight = ambience.airlight.astype(np.float32)
     colours = {"rain": rain_colour, "snow": snow_colour}
     found = []
     for field, part in zip(fields, resolved, strict=True):
         particles = field.particles(frame.camera, frame.time_s, part, window)
-        splats = np.empty((len(particles), 12), np.float32)
+        splats = np.empty((len(particles), 13), np.float32)
         colour = colours[field.population.kind](light).astype(np.float32)
         count = project(particles, optics, medium, carried, colour, airlight, window, splats)
         found.append(splats[:count])
-    return np.concatenate(found) if found else np.empty((0, 12), np.float32)
+    return np.concatenate(found) if found else np.empty((0, 13), np.float32)
 
 
 def _trimmed(

@@ -82,11 +82,11 @@ def path_optical_depth(z, ray_x, ray_y, optics, medium, resolved_depth):
         sine = max(rise / norm, np.float32(0.05))
         z = min(np.float32(1000.0) / sine, np.float32(20000.0)) / norm
     path_m = z * norm
-    heights = min(max(z * rise * medium.inverse_height_per_m, np.float32(-8.0)), np.float32(80.0))
+    heights = max(z * rise * medium.inverse_height_per_m, np.float32(-8.0))
     if abs(heights) < np.float32(0.05):
         share = _mean_of_thin_layer(heights)
     else:
-        share = (one - survival(heights)) / heights
+        share = (one - survival(min(heights, np.float32(80.0)))) / heights
     last = np.int32(resolved_depth.shape[0] - 1)
     # Compared as a float first: the sky's bin does not fit an integer's range on every machine.
     position = min(z * (one / medium.resolved_step_m), np.float32(last))
@@ -126,9 +126,8 @@ def transmittance_row(depth, ray_x, ray_y, optics, medium, resolved_depth, tau, 
             rise = optics.up_x * ray_x[x] + rise_y
             heights = out[x] * rise * medium.inverse_height_per_m
             heights = heights if heights > lowest else lowest
-            heights = heights if heights < highest else highest
             away = heights if abs(heights) >= thin else thin
-            share = (one - survival(away)) / away
+            share = (one - survival(away if away < highest else highest)) / away
             share = share if abs(heights) >= thin else _mean_of_thin_layer(heights)
             tau[x] += medium.fog_per_m * share * out[x] * slant[x]
     if medium.precipitation_per_m > zero:

@@ -31,7 +31,8 @@ def project(particles, optics, medium, resolved_depth, colour, airlight, window,
         colour: (3,) float32 of a particle.
         airlight: (3,) float32.
         window: (top, left, height, width).
-        splats: (N, 12) float32 out: u, v, conic a b c, reach^2, peak, depth, rgb, covers.
+        splats: (N, 13) float32 out: u, v, conic a b c, reach^2, peak, depth, rgb, covers, half
+            height.
 
     Returns:
         Number of splats.
@@ -61,11 +62,15 @@ def project(particles, optics, medium, resolved_depth, colour, airlight, window,
         a = a0 + qx * qx * twelfth + soft
         b = b0 + qx * qy * twelfth
         c = c0 + qy * qy * twelfth + soft
-        det = a * c - b * b
-        peak = np.sqrt(max(a0 * c0 - b0 * b0, np.float32(0.0)) / det) + np.float32(FAINTEST)
+        # Term by term, because a c - b b cancels to nothing for a sweep of many pixels.
+        det_sharp = s2 * s2 * sx * sx * sy * sy * (one + tx * tx + ty * ty)
+        ac, cc = a0 + soft, c0 + soft
+        swept = ac * qy * qy + cc * qx * qx - np.float32(2.0) * b0 * qx * qy
+        det = det_sharp + soft * (a0 + c0 + soft) + twelfth * max(swept, np.float32(0.0))
+        peak = np.sqrt(det_sharp / det) + np.float32(FAINTEST)
         peak = min(peak, np.float32(0.99))
         reach2 = np.float32(2.0) * np.float32(np.log(np.float64(peak / np.float32(FAINTEST))))
-        if reach2 <= np.float32(0.0):
+        if not reach2 > np.float32(0.0):
             continue
         u, v = optics.cx + optics.fx * tx, optics.cy + optics.fy * ty
         half_u, half_v = np.sqrt(reach2 * a), np.sqrt(reach2 * c)
@@ -78,6 +83,7 @@ def project(particles, optics, medium, resolved_depth, colour, airlight, window,
         row[0], row[1] = u, v
         row[2], row[3], row[4] = c / det, -b / det, a / det
         row[5], row[6], row[7] = reach2, peak, z
+        row[12] = half_v
         for k in range(3):
             row[8 + k] = through * colour[k] + (one - through) * airlight[k]
         area = np.float32(np.pi) * reach2 * np.sqrt(det)
@@ -112,9 +118,9 @@ def order_by_band(splats, window, bands):
     first = np.empty(n, np.int32)
     last = np.empty(n, np.int32)
     for i in range(n):
-        half = np.sqrt(splats[i, 5] * splats[i, 2] / _det(splats[i]))
-        low = max(np.int64(np.floor(splats[i, 1] - half)) - top, 0)
-        high = min(np.int64(np.ceil(splats[i, 1] + half)) - top, height - 1)
+        half = splats[i, 12]
+        low = min(max(np.int64(np.floor(splats[i, 1] - half)) - top, 0), height - 1)
+        high = max(min(np.int64(np.ceil(splats[i, 1] + half)) - top, height - 1), low)
         first[i], last[i] = low // BAND_ROWS, high // BAND_ROWS
         for band in range(first[i], last[i] + 1):
             band_starts[band + 1] += 1
@@ -128,9 +134,3 @@ def order_by_band(splats, window, bands):
             order[fill[band]] = i
             fill[band] += 1
     return order, band_starts
-
-
-@compiled
-def _det(splat):
-    """Determinant of the conic, the inverse of the covariance's."""
-    return splat[2] * splat[4] - splat[3] * splat[3]

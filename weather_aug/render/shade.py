@@ -60,7 +60,7 @@ def shade(
         matrix: (3, 3) float32 colour matrix after it.
         tone: Sky.
         airlight: (3,) float32.
-        splats: (N, 12) float32.
+        splats: (N, 13) float32.
         order: Splat indices by band.
         band_starts: (bands + 1,).
         falloff: exp(-x / 2) for x in [0, 12.5), float32.

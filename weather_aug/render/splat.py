@@ -19,13 +19,14 @@ def blend_splat(splat, rows, window, falloff, planes, covered):
     last_slot = np.int32(falloff.shape[0] - 1)
     near_edge, one = np.float32(0.1), np.float32(1.0)
     inverse_a = one / a
-    det = a * c - b * b
-    half_v = np.sqrt(reach2 * a / det)
+    half_v = splat[12]
+    # What is left of the row's interval falls from all at the middle to nothing at half_v.
+    fade = a * reach2 / (half_v * half_v)
     y0 = max(np.int64(np.ceil(v - half_v)) - top, rows[0])
     y1 = min(np.int64(np.floor(v + half_v)) - top, rows[1] - 1)
     for y in range(y0, y1 + 1):
         dy = np.float32(y + top) - v
-        room = a * reach2 - det * dy * dy
+        room = a * reach2 - fade * dy * dy
         if room <= np.float32(0.0):
             continue
         middle = u - b * dy * inverse_a

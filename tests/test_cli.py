@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 from tiny_clip import digests_of
 
-from weather_aug.cli import main
+import weather_aug
+from weather_aug.cli import Export, main, parsed_types
+from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.weather import Weather
 
@@ -86,6 +88,75 @@ def test_render_takes_one_camera_and_what_the_weather_left(
     assert len(list(out.iterdir())) == 4
 
 
+def test_render_writes_invalid_masks_without_labels(
+    unlabelled_scene: WeatherScene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "pictures"
+    main(
+        f"render {unlabelled_scene.path} --camera front --labels --weather fog --out {out}".split()
+    )
+    assert capsys.readouterr().out.splitlines() == [
+        f"4 pictures in {out}",
+        "4 of them have no label; only their invalid masks were written",
+    ]
+    keys = [str(key) for key in unlabelled_scene.keys if key.camera == "front"]
+    suffixes = ("", "_invIds")
+    assert {p.stem for p in out.iterdir()} == {f"{k}{suffix}" for k in keys for suffix in suffixes}
+    shot = unlabelled_scene.render(unlabelled_scene.keys[0], Weather.fog("heavy"))
+    invalid = cv2.imread(str(out / f"{keys[0]}_invIds.png"), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(invalid, shot.invalid)
+
+
+def test_export_takes_weights_of_types(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "data"
+    main([*f"export {folder} --out {out} --count 12 --types rain=2 rain+fog=1e0 snow=0".split()])
+    assert capsys.readouterr().err == ""
+    job = json.loads((out / "export.json").read_text())["job"]
+    assert job["policy"]["types"] == {"rain": 2.0, "rain+fog": 1.0, "snow": 0.0}
+
+
+def test_exports_default_is_the_policys() -> None:
+    assert parsed_types(Export.types) == WeatherPolicy().types
+
+
+def test_an_export_without_labels_warns(
+    folder: Path,
+    unlabelled_scene: WeatherScene,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / "data"
+    main([*f"export {folder} {unlabelled_scene.path} --out {out} --count 16".split()])
+    captured = capsys.readouterr()
+    assert captured.out == f"16 samples in {out}\n"
+    assert captured.err == "weather-aug: warning: 8 of 16 samples have no label\n"
+
+
+def test_verify_repairs_what_inspect_finds(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "data"
+    command = f"export {folder} --out {out} --count 3".split()
+    main(command)
+    whole = digests_of(out)
+    victim = min((out / "leftImg8bit").rglob("*.png"))
+    data = bytearray(victim.read_bytes())
+    data[len(data) // 2] ^= 1
+    victim.write_bytes(data)
+    main(command)
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as caught:
+        main(["inspect", str(out)])
+    captured = capsys.readouterr()
+    assert caught.value.code == 4
+    assert victim.name in captured.out
+    assert captured.err.endswith("run the same export again with --verify to repair it\n")
+    main([*command, "--verify"])
+    assert digests_of(out) == whole
+
+
 def test_export_writes_a_data_set(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -119,6 +190,36 @@ def test_a_build_goes_on_after_an_interruption(
     assert "3 frames" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        ("export {scene} --out {new}", "interrupted; run the same command again to continue"),
+        ("render {scene} --out {new}", "interrupted"),
+        ("sweep {scene} --out {new}", "interrupted"),
+        ("inspect {scene}", "interrupted"),
+    ],
+)
+def test_only_what_goes_on_says_so(
+    folder: Path,
+    tmp_path: Path,
+    command: str,
+    says: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def interrupted(path: Path) -> WeatherScene:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(WeatherScene, "load", interrupted)
+    arguments = command.format(scene=folder, new=tmp_path / "new").split()
+    assert refused(arguments, capsys) == (130, f"weather-aug: {says}")
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["--version"])
+    assert capsys.readouterr().out == f"weather-aug {weather_aug.__version__}\n"
+
+
 USAGE = {
     "unknown scheme": ("build sky:/data --out {new}", "no scheme 'sky'"),
     "no scheme": ("build data --out {new}", "has no scheme"),
@@ -133,6 +234,22 @@ USAGE = {
     "a seed too wide": (f"render {{scene}} --out {{new}} --seed {2**64}", "seed"),
     "unknown time": ("sweep {scene} --out {new} --time 99", "no frame 000099_front"),
     "unknown camera in a sweep": ("sweep {scene} --out {new} --camera rear", "no camera 'rear'"),
+    "unknown severity of clear": (
+        "render {scene} --out {new} --weather clear --severity mild",
+        "severity 'mild'",
+    ),
+    "fog that fell": ("render {scene} --out {new} --weather fog --no-falling", "--no-falling"),
+    "clear that fell": ("render {scene} --out {new} --weather clear --no-falling", "--no-falling"),
+    "unknown that fell": ("render {scene} --out {new} --weather hail --no-falling", "'hail'"),
+    "a type without weight": ("export {scene} --out {new} --types rain", "type=weight"),
+    "a type without name": ("export {scene} --out {new} --types =1", "type=weight"),
+    "a weight of words": ("export {scene} --out {new} --types rain=much", "'rain=much'"),
+    "a weight of NaN": ("export {scene} --out {new} --types rain=nan", "weight of rain"),
+    "a weight below 0": ("export {scene} --out {new} --types rain=-1", "weight of rain"),
+    "a type twice": ("export {scene} --out {new} --types rain=1 rain=2", "'rain' stands twice"),
+    "an unknown type": ("export {scene} --out {new} --types rain+hail=1", "type 'hail'"),
+    "a narrow demo": ("demo --out {new} --width 8", "width must be in [32, 4096]"),
+    "a demo of nothing": ("demo --out {new} --frames 0", "frames"),
     "no width": ("sweep {scene} --out {new} --tile-width 0", "tile_width"),
 }
 
@@ -213,8 +330,11 @@ def test_inspect_finds_every_changed_byte(folder: Path, capsys: pytest.CaptureFi
         main(["inspect", str(folder)])
     captured = capsys.readouterr()
     assert caught.value.code == 4
-    assert all(name in captured.out + captured.err for name in names)
+    assert all(name in captured.out for name in names)
     assert "every file is whole" not in captured.out
+    assert captured.err.splitlines() == [
+        f"weather-aug: {folder} is not whole (2 problems); build the scene again"
+    ]
 
 
 def test_an_existing_output_is_exit_code_5(
@@ -234,10 +354,21 @@ def test_an_unwritable_output_is_exit_code_6(
     (tmp_path / "file").write_text("mine")
     code, line = refused(["sweep", str(folder), "--out", str(tmp_path / "file" / "a.png")], capsys)
     assert (code, "cannot write" in line) == (6, True)
-    code, line = refused(["build", STREET, "--out", str(tmp_path / "no" / "scene")], capsys)
-    assert (code, "does not exist" in line) == (6, True)
+    code, line = refused(["build", STREET, "--out", str(tmp_path / "file" / "scene")], capsys)
+    assert (code, str(tmp_path / "file") in line) == (6, True)
     code, line = refused(["demo", "--out", str(tmp_path / "file" / "demo")], capsys)
     assert (code, "cannot write" in line) == (6, True)
+
+
+@pytest.mark.parametrize("command", ["render {scene} --out {file}", "demo --out {file}"])
+def test_a_file_where_a_folder_should_be(
+    folder: Path, tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "file"
+    file.write_text("mine")
+    code, line = refused(command.format(scene=folder, file=file).split(), capsys)
+    assert (code, f"{file} is a file" in line) == (6, True), line
+    assert file.read_text() == "mine"
 
 
 def test_a_program_of_its_own_prints_one_line_and_no_traceback(tmp_path: Path) -> None:
@@ -253,7 +384,7 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
         main(["--help"])
     assert not caught.value.code
     out = capsys.readouterr().out
-    for command in ("build", "render", "sweep", "export", "inspect", "demo"):
+    for command in ("build", "render", "sweep", "export", "inspect", "demo", "--version"):
         assert command in out
 
 

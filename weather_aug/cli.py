@@ -6,16 +6,27 @@ import json
 import os
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from tyro.conf import Positional
 
-from weather_aug import _files
-from weather_aug.errors import ArgumentError, DataError, IntegrityError, WeatherAugError, printable
+from weather_aug import __version__, _files
+from weather_aug.errors import (
+    ArgumentError,
+    DataError,
+    IntegrityError,
+    OutputError,
+    WeatherAugError,
+    printable,
+)
 from weather_aug.taxonomy import IGNORE
+from weather_aug.weather import Weather, parse_severity
+
+DEMO_WIDTH_PX = (32, 4096)
+"""Narrower, a picture of nine sixteenths its width has too few rows for the street."""
 
 
 @dataclass(frozen=True)
@@ -71,17 +82,19 @@ class Render:
     max_particles: int = 30_000
     """Expected number of resolved particles in a picture at the most."""
     labels: bool = False
-    """Write the remapped labels and the invalid mask too."""
+    """Write the invalid masks too, and the remapped labels where there are labels."""
 
     def run(self) -> None:
         """Render and name the folder."""
         from tqdm.auto import tqdm
 
         from weather_aug.render.compose import RenderOptions
-        from weather_aug.scene.policy import weather_of
         from weather_aug.scene.scene import WeatherScene
         from weather_aug.view.sheet import write_png
 
+        weather = self._weather()
+        options = RenderOptions(self.max_particles)
+        _check_folder(self.out)
         scene = WeatherScene.load(self.scene)
         keys = [k for k in scene.keys if self.camera in (None, k.camera)]
         if not keys:
@@ -89,15 +102,30 @@ class Render:
                 f"scene {scene.name} has no camera {printable(self.camera)!r}; it has "
                 f"{', '.join(scene.cameras)}"
             )
-        weather = weather_of(self.weather, _severity(self.severity), falling=self.falling)
-        options = RenderOptions(self.max_particles)
+        unlabelled = 0
         for key in tqdm(keys, desc="render", unit="frame", disable=not _to_people()):
             shot = scene.render(key, weather, seed=self.seed, options=options)
             write_png(self.out / f"{key}.png", shot.image)
-            if self.labels and shot.label is not None:
-                write_png(self.out / f"{key}_labelTrainIds.png", shot.label)
+            if self.labels:
                 write_png(self.out / f"{key}_invIds.png", shot.invalid)
+                if shot.label is not None:
+                    write_png(self.out / f"{key}_labelTrainIds.png", shot.label)
+            unlabelled += shot.label is None
         _say(f"{len(keys)} pictures in {self.out}")
+        if self.labels and unlabelled:
+            _say(f"{unlabelled} of them have no label; only their invalid masks were written")
+
+    def _weather(self) -> Weather:
+        from weather_aug.scene.policy import weather_of
+
+        severity = parse_severity(_severity(self.severity))
+        weather = weather_of(self.weather, severity, falling=self.falling)
+        if not self.falling and self.weather not in ("rain", "snow"):
+            raise ArgumentError(
+                f"--no-falling is for rain and snow, which leave something behind; {self.weather} "
+                "does not fall"
+            )
+        return weather
 
 
 @dataclass(frozen=True)
@@ -147,10 +175,8 @@ class Export:
     """Folder of the data set."""
     count: int = 1000
     """Samples to write."""
-    types: dict[str, float] = field(
-        default_factory=lambda: {"clear": 1.0, "rain": 2.0, "snow": 2.0, "fog": 1.0}
-    )
-    """Weight of each weather type."""
+    types: tuple[str, ...] = ("clear=1", "rain=2", "snow=2", "fog=1")
+    """Weather types and how often each is drawn, "type=weight"; "rain+fog=1" is both at once."""
     severity: tuple[float, float] = (0.1, 1.0)
     """Range of severities."""
     falling: float = 0.8
@@ -159,6 +185,8 @@ class Export:
     """Of all draws."""
     workers: int = 1
     """Processes; the result does not depend on it."""
+    verify: bool = False
+    """Compare every byte of what is there already, not only sizes, and repair what differs."""
 
     def run(self) -> None:
         """Export and say what was written."""
@@ -167,11 +195,16 @@ class Export:
         from weather_aug.writers.export import export
         from weather_aug.writers.plan import plan_export
 
+        policy = WeatherPolicy(parsed_types(self.types), self.severity, self.falling)
         scenes = [WeatherScene.load(path) for path in self.scenes]
-        policy = WeatherPolicy(self.types, self.severity, self.falling)
         plan = plan_export(scenes, policy, count=self.count, seed=self.seed)
-        export(plan, self.out, workers=self.workers, progress=_to_people())
-        _say(f"{self.count} samples in {self.out}")
+        report = export(
+            plan, self.out, workers=self.workers, progress=_to_people(), verify=self.verify
+        )
+        _say(f"{report.samples} samples in {self.out}")
+        unlabelled = report.samples - report.labelled
+        if unlabelled:
+            _complain(f"warning: {unlabelled} of {report.samples} samples have no label")
 
 
 @dataclass(frozen=True)
@@ -183,11 +216,12 @@ class Inspect:
 
     def run(self) -> None:
         """Print the contents, then verify; damage ends with exit code 4."""
-        problems = _inspected(self.path)
-        for problem in problems[1:]:
+        problems, cure = _inspected(self.path)
+        for problem in problems:
             _say(problem)
         if problems:
-            raise IntegrityError(problems[0])
+            count = f"{len(problems)} problem{'s' if len(problems) > 1 else ''}"
+            raise IntegrityError(f"{printable(self.path, 200)} is not whole ({count}); {cure}")
         _say("every file is whole")
 
 
@@ -210,11 +244,15 @@ class Demo:
         from weather_aug.view.sheet import contact_sheet, write_png
 
         start = time.perf_counter()
+        low, high = DEMO_WIDTH_PX
+        if not low <= self.width <= high:
+            raise ArgumentError(f"width must be in [{low}, {high}] pixels, got {self.width}")
+        height = self.width * 9 // 16
+        clip = open_clip(f"street:?frames={self.frames}&width={self.width}&height={height}")
+        _check_folder(self.out)
         _say("1/3 build a scene of the procedural street, three cameras (the first run compiles)")
         with _files.reported(self.out):
             self.out.mkdir(parents=True, exist_ok=True)
-        height = self.width * 9 // 16
-        clip = open_clip(f"street:?frames={self.frames}&width={self.width}&height={height}")
         scene = WeatherScene.build(clip, self.out / "scene", progress=_to_people(), overwrite=True)
         _say("2/3 draw weather on the fly, as a training loop does")
         dataset = WeatherDataset([scene], seed=1)
@@ -243,33 +281,63 @@ Command = (
 
 def main(arguments: list[str] | None = None) -> None:
     """Run one command; an error is one line and an exit code (see `weather_aug.errors`)."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments == ["--version"]:
+        _say(f"weather-aug {__version__}")
+        return
     command = tyro.cli(
         Command,
         prog="weather-aug",
-        description="Rain, snow and fog for driving images.",
+        description="Rain, snow and fog for driving images; --version prints the version.",
         args=arguments,
     )
     try:
         command.run()
     except WeatherAugError as error:
-        print(f"weather-aug: {error}", file=sys.stderr)
+        _complain(str(error))
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
-        print("weather-aug: interrupted; run the same command again to continue", file=sys.stderr)
+        goes_on = isinstance(command, Build | Export)
+        cure = "; run the same command again to continue" if goes_on else ""
+        _complain(f"interrupted{cure}")
         sys.exit(130)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _inspected(path: Path) -> list[str]:
+def parsed_types(items: tuple[str, ...]) -> dict[str, float]:
+    """Weights by weather type of texts "type=weight"; what a type is, `WeatherPolicy` decides.
+
+    Raises:
+        ArgumentError: If a text is no type and number, or a type stands twice.
+    """
+    weights: dict[str, float] = {}
+    for item in items:
+        name, _, text = item.partition("=")
+        try:
+            weight = float(text)
+        except ValueError:
+            weight = None
+        if not name or weight is None:
+            raise ArgumentError(
+                f"--types takes type=weight, such as rain=2 rain+fog=1, got {printable(item)!r}"
+            )
+        if name in weights:
+            raise ArgumentError(f"--types: {printable(name)!r} stands twice")
+        weights[name] = weight
+    return weights
+
+
+def _inspected(path: Path) -> tuple[list[str], str]:
+    """What is wrong with a scene or an export, one sentence each, and the cure."""
     from weather_aug.scene import store
     from weather_aug.writers import layout
     from weather_aug.writers.verify import verify_export
 
     if (path / store.MANIFEST).is_file():
-        return _inspect_scene(path)
+        return _inspect_scene(path), "build the scene again"
     if any((path / name).exists() for name in (layout.CONTENTS, layout.JOURNAL)):
-        return verify_export(path)
+        return verify_export(path), "run the same export again with --verify to repair it"
     raise DataError(
         f"{printable(path, 200)} is neither a scene (no {store.MANIFEST}) nor an export (no "
         f"{layout.CONTENTS})"
@@ -304,6 +372,18 @@ def _severity(text: str) -> float | str:
         return float(text)
     except ValueError:
         return text
+
+
+def _check_folder(out: Path) -> None:
+    """Refuse an output folder that is a file, before any work is done for it."""
+    with _files.reported(out):
+        is_file = out.exists() and not out.is_dir()
+    if is_file:
+        raise OutputError(f"{printable(out, 200)} is a file; choose a folder for the pictures")
+
+
+def _complain(text: str) -> None:
+    print(f"weather-aug: {text}", file=sys.stderr)
 
 
 def _say(text: str) -> None:

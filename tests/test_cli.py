@@ -337,6 +337,21 @@ def test_inspect_finds_every_changed_byte(folder: Path, capsys: pytest.CaptureFi
     ]
 
 
+@pytest.mark.parametrize("text", ["{", "{}", '{"format": "other"}'])
+def test_inspect_of_a_damaged_manifest_ends_with_the_cure(
+    folder: Path, tmp_path: Path, text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "scene.json").write_text(text)
+    code, line = refused(["inspect", str(folder)], capsys)
+    assert code in (3, 4)
+    assert line.endswith(" again"), line
+
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "export.json").write_text(text)
+    code, line = refused(["inspect", str(tmp_path / "data")], capsys)
+    assert (code, line.endswith("remove the folder and export again")) == (4, True), line
+
+
 def test_an_existing_output_is_exit_code_5(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -337,17 +337,34 @@ def _inspected(path: Path) -> tuple[list[str], str]:
     if (path / store.MANIFEST).is_file():
         return _inspect_scene(path), "build the scene again"
     if any((path / name).exists() for name in (layout.CONTENTS, layout.JOURNAL)):
-        return verify_export(path), "run the same export again with --verify to repair it"
+        return verify_export(path), _cure_of_export(path / layout.CONTENTS)
     raise DataError(
         f"{printable(path, 200)} is neither a scene (no {store.MANIFEST}) nor an export (no "
         f"{layout.CONTENTS})"
     )
 
 
+def _cure_of_export(contents: Path) -> str:
+    from weather_aug.writers import layout
+
+    try:
+        if contents.exists():
+            layout.read_contents(contents.parent)
+    except (DataError, IntegrityError, OSError):
+        # Nobody knows any more which job it was.
+        return "remove the folder and export again"
+    return "run the same export again with --verify to repair it"
+
+
 def _inspect_scene(path: Path) -> list[str]:
     from weather_aug.scene.scene import WeatherScene
 
-    scene = WeatherScene.load(path)
+    try:
+        scene = WeatherScene.load(path)
+    except (DataError, IntegrityError) as error:
+        if str(error).endswith("again"):
+            raise
+        raise type(error)(f"{error}; build the scene again") from None
     manifest = scene.manifest
     labelled = sum("label" in record.files for record in manifest.frames)
     size_mib = sum(stored.size for stored in manifest.files.values()) / 2**20

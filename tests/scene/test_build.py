@@ -520,9 +520,11 @@ def test_a_killed_build_is_continued(tiny_scene: WeatherScene, out: Path) -> Non
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == b"ready\n"
-        with pytest.raises(ConflictError, match=f"by process {process.pid} on"):
-            WeatherScene.build(TinyClip(), out)
-        process.send_signal(signal.SIGKILL)
+        try:
+            with pytest.raises(ConflictError, match=f"by process {process.pid} on"):
+                WeatherScene.build(TinyClip(), out)
+        finally:
+            process.send_signal(signal.SIGKILL)
         assert process.wait(timeout=30) == -signal.SIGKILL
     assert not out.exists()
     again = Watched()

@@ -139,7 +139,7 @@ class Taxonomy:
             row, column = (int(v) for v in np.argwhere(~known)[0])
             raise DataError(
                 f"{printable(where)}: label id {int(label[row, column])} at row {row}, column "
-                f"{column} is not one of {self.name}; choose the taxonomy with labels=…"
+                f"{column} is not one of {self.name}; choose another with taxonomy=…"
             )
         return table[small]
 

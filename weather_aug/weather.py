@@ -358,16 +358,12 @@ def _combine(a: Weather, b: Weather, share_a: float, share_b: float) -> Weather:
         min(max(share_a * x + share_b * y, -60.0), 60.0)
         for x, y in zip(a.wind_m_per_s, b.wind_m_per_s, strict=True)
     )
-    # Without any fog heights weigh alike; they say something only once fog is added.
-    fog_a = share_a / a.visibility_m
-    fog_b = share_b / b.visibility_m
-    inverse = fog_a + fog_b
-    thinning = (
-        (fog_a / a.fog_scale_height_m + fog_b / b.fog_scale_height_m) / inverse
-        if inverse
-        else (share_a / a.fog_scale_height_m + share_b / b.fog_scale_height_m) / (share_a + share_b)
-    )
-    state["visibility_m"] = max(1 / inverse, _RANGES["visibility_m"][0]) if inverse else math.inf
+    fog_a, fog_b = share_a / a.visibility_m, share_b / b.visibility_m
+    fog = fog_a + fog_b
+    # Without any fog the heights weigh alike; they say something only once fog is added.
+    part_a, part_b = (fog_a / fog, fog_b / fog) if fog else (share_a, share_b)
+    thinning = part_a / a.fog_scale_height_m + part_b / b.fog_scale_height_m
+    state["visibility_m"] = max(1 / fog, _RANGES["visibility_m"][0]) if fog else math.inf
     lowest = _RANGES["fog_scale_height_m"][0]
     state["fog_scale_height_m"] = max(1 / thinning, lowest) if thinning else math.inf
     return Weather(**state)

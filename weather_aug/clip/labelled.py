@@ -49,6 +49,11 @@ class LabelledClip:
         return self._clip.keys
 
     @property
+    def is_drive(self) -> bool:
+        """Whether the clip is one drive under one light."""
+        return bool(getattr(self._clip, "is_drive", True))
+
+    @property
     def up_world(self) -> Float64:
         """(3,) unit vector against gravity."""
         return self._clip.up_world

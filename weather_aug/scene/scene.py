@@ -15,7 +15,7 @@ from weather_aug.render.light import Ambience
 from weather_aug.scene import store
 
 if TYPE_CHECKING:
-    from weather_aug.weather import Weather
+    from weather_aug.weather import Weather, Wind
 
 
 class WeatherScene:
@@ -120,6 +120,7 @@ class WeatherScene:
         *,
         seed: int = 0,
         window: Window | None = None,
+        drift_m: Wind | None = None,
         options: RenderOptions = DEFAULT_OPTIONS,
     ) -> RenderedFrame:
         """Render one frame in a weather; see `weather_aug.render.compose.render`.
@@ -129,6 +130,8 @@ class WeatherScene:
             weather: State of air and ground.
             seed: Which particles fall.
             window: (top, left, height, width); the whole picture if None.
+            drift_m: How far the wind has carried the air since the clip's start (along the street,
+                to its left, up); wind times time if None.
             options: Budget.
         """
         return render(
@@ -137,6 +140,7 @@ class WeatherScene:
             seed=seed,
             ambience=self.ambience(key),
             window=window,
+            drift_m=drift_m,
             options=options,
         )
 

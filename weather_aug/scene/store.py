@@ -249,7 +249,7 @@ def _check_label(frame: Frame) -> None:
     if unknown.size:
         raise SceneError(
             f"frame {frame.key}: label holds {int(unknown[0])}, which is no train id; choose the "
-            "clip's taxonomy with labels=…"
+            "clip's taxonomy with taxonomy=…"
         )
 
 

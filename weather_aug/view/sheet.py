@@ -19,6 +19,7 @@ from weather_aug.render.compose import RenderedFrame
 from weather_aug.scene.policy import weather_of
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.taxonomy import coloured
+from weather_aug.weather import Weather
 
 UInt8 = NDArray[np.uint8]
 
@@ -55,7 +56,7 @@ def sweep(
     clear = scene.render(key, weather_of("clear", 0.0), seed=seed).image
     rows = []
     for kind in kinds:
-        shots = [scene.render(key, weather_of(kind, s), seed=seed).image for s in severities]
+        shots = [_shot(scene, key, weather_of(kind, s), seed).image for s in severities]
         rows.append([clear, *shots])
     return grid(rows, kinds, ["clear", *(str(s) for s in severities)], tile_width)
 
@@ -84,7 +85,7 @@ def contact_sheet(
     rows: list[list[UInt8]] = []
     names: list[str] = []
     for key in keys:
-        shots = [scene.render(key, weather_of(kind, s), seed=seed) for kind, s in states]
+        shots = [_shot(scene, key, weather_of(kind, s), seed) for kind, s in states]
         rows.append([shot.image for shot in shots])
         names.append(key.camera)
         if shots[0].label is not None:
@@ -152,6 +153,11 @@ def write_png(path: Path, image: UInt8) -> None:
     with _files.reported(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     _files.write_whole(path, png)
+
+
+def _shot(scene: WeatherScene, key: FrameKey, weather: Weather, seed: int) -> RenderedFrame:
+    """One picture of a sheet; the air has drifted alike in all, so that drops stay."""
+    return scene.render(key, weather, seed=seed, drift_m=(0.0, 0.0, 0.0))
 
 
 def _label(shot: RenderedFrame) -> UInt8:

@@ -64,7 +64,7 @@ def export(
 
     Args:
         plan: What to render; see `plan_export`.
-        out: Folder to make or to continue; its parent must exist.
+        out: Folder to make or to continue.
         workers: Processes; up to 1 renders in this one.
         progress: Show a bar with rate and time left.
         verify: Compare digests, not only sizes, where the export is finished already.

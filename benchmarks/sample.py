@@ -1,7 +1,8 @@
 """The share of a dataloader's sample that weather costs.
 
-A sample is: decode a 1024 x 2048 PNG, cut 512 x 512, cut the label. With weather it is the same
-with depth read from the scene and rain, snow or fog of all severities rendered over the crop.
+A sample is: decode a 1024 x 2048 PNG, cut 512 x 512 of it and of the label, make tensors. With
+weather it is the same with depth read from the scene and rain, snow or fog of all severities
+rendered over the crop.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 
 from benchmarks.scene import street
 from benchmarks.timing import interleaved
@@ -60,7 +62,8 @@ def main() -> None:
                 np.frombuffer(image_path.read_bytes(), np.uint8), cv2.IMREAD_COLOR_RGB
             )
             label = np.load(label_path, mmap_mode="r")
-            return image[part].copy(), np.array(label[part])
+            tensor = torch.from_numpy(image[part]).permute(2, 0, 1).contiguous()
+            return tensor, torch.from_numpy(np.array(label[part])).long()
 
         def weathered(policy: WeatherPolicy) -> object:
             dataset = WeatherDataset([scene], policy, crop=(CROP, CROP))

@@ -79,7 +79,7 @@ class Render:
     """Only this camera."""
     seed: int = 0
     """Which particles fall."""
-    max_particles: int = 30_000
+    max_particles: int = 20_000
     """Expected number of resolved particles in a picture at the most."""
     labels: bool = False
     """Write the invalid masks too, and the remapped labels where there are labels."""

@@ -39,7 +39,7 @@ FALLOFF_STEPS = 2048
 class RenderOptions:
     """How much work to spend on a frame."""
 
-    max_particles: int = 30_000
+    max_particles: int = 20_000
     """Expected number of resolved particles in a whole picture; the rest becomes extinction."""
 
     def __post_init__(self) -> None:

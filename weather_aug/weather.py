@@ -121,7 +121,7 @@ class Weather:
         Args:
             severity: In [0, 1] or a name (light, moderate, heavy, extreme).
             mm_per_h: The liquid-equivalent rate instead of a severity.
-            falling: False for snow on the ground under clear air.
+            falling: False for the time after: snow on the ground and overcast sky, clear air.
             **overrides: Fields of Weather in their units.
         """
         s = _severity(severity, "mm_per_h", mm_per_h, snow_severity)

@@ -9,8 +9,18 @@ from hypothesis import strategies as st
 from render_scene import make_camera, make_frame
 
 from weather_aug.errors import ArgumentError
-from weather_aug.render.compose import RenderOptions, _clean_depth, checked_window, render
+from weather_aug.particles.kernels import scatter, solve_reach
+from weather_aug.render import planes
+from weather_aug.render.compose import (
+    RenderOptions,
+    _clean_depth,
+    checked_window,
+    render,
+    warm_up,
+)
 from weather_aug.render.light import Ambience, airlight_from_sky, ambience_of
+from weather_aug.render.project import order_by_band, project
+from weather_aug.render.shade import shade
 from weather_aug.scene.policy import weather_of
 from weather_aug.taxonomy import SKY
 from weather_aug.weather import Weather
@@ -252,3 +262,20 @@ def test_half_precision_depth_is_widened_exactly():
     far = ~((expected > 0) & (expected < 60000))
     np.testing.assert_array_equal(np.where(far, np.inf, expected), wide)
     np.testing.assert_array_equal(wide, _clean_depth(half.astype(np.float32)[None])[0])
+
+
+def test_warm_up_leaves_nothing_to_compile():
+    """Else each worker of a fresh machine compiles for itself, all at once."""
+    warm_up()
+    kernels = (shade, project, order_by_band, planes.widen_depth, planes.clean_depth)
+    kernels += (planes.raise_sky, planes.read_labels, scatter, solve_reach)
+    before = [len(kernel.signatures) for kernel in kernels]
+    frame = street_frame()
+    half = replace(frame, depth_m=np.nan_to_num(frame.depth_m, posinf=65504).astype(np.float16))
+    for array in (half.image, half.label, half.depth_m):
+        array.flags.writeable = False
+    for weather in (Weather.fog(1.0), Weather.rain(0.5), Weather.snow(1.0)):
+        for candidate in (frame, half):
+            render(candidate, weather, seed=0, ambience=AMBIENCE)
+            render(candidate, weather, seed=0, ambience=AMBIENCE, window=(5, 7, 20, 30))
+    assert before == [len(kernel.signatures) for kernel in kernels]

@@ -4,8 +4,8 @@ Convention:
     The field of a class of particles is endless, at rest in a frame that drifts with the class's
     velocity (wind plus fall), and a pure function of (seed, kind, class, place). Nothing is
     stepped and nothing is recycled: any time and any camera can be asked for alone, two cameras
-    see the same particles, and a higher rate adds particles to those of a lower one. Positions are
-    in world metres; time is in seconds.
+    see the same particles, and where a class is denser at a higher rate (all of rain) particles are
+    added to those already there. Positions are in world metres; time is in seconds.
 """
 
 from __future__ import annotations

@@ -143,24 +143,29 @@ def checked_window(window: Window | None, height: int, width: int) -> Window:
 
 
 def warm_up() -> None:
-    """Compile or load all kernels now, before worker processes are started."""
+    """Compile or load all kernels now, before worker processes are started.
+
+    A frame as a scene stores it (half-precision depth, a label) and one as a caller may pass it.
+    """
     intrinsics = np.array([[16.0, 0, 8], [0, 16, 8], [0, 0, 1]])
     camera = Camera(intrinsics, np.eye(4), 16, 16)
     axes = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     grey = np.full(3, 0.5)
     ambience = Ambience(axes, grey, grey, grey, grey)
     image = np.full((16, 16, 3), 128, np.uint8)
-    depth = np.full((16, 16), 20.0, np.float32)
-    frame = Frame(FrameKey(0, "warm-up"), 0.0, camera, image, None, depth)
+    depth = np.full((16, 16), 20.0)
+    label = np.zeros((16, 16), np.uint8)
     storm = Weather.mix(Weather.rain("heavy"), Weather.snow("heavy"))
-    render(frame, storm, seed=0, ambience=ambience)
+    for dtype in (np.float16, np.float32):
+        frame = Frame(FrameKey(0, "warm-up"), 0.0, camera, image, label, depth.astype(dtype))
+        render(frame, storm, seed=0, ambience=ambience)
 
 
 def _clear(frame: Frame, window: Window) -> RenderedFrame:
     image, label, depth = _cut(frame, window)
     return RenderedFrame(
-        image.copy(),
-        None if label is None else label.copy(),
+        image,
+        label,
         None if label is None else label.copy(),
         np.zeros(depth.shape, np.uint8),
         np.ones(depth.shape, np.float32),
@@ -169,25 +174,26 @@ def _clear(frame: Frame, window: Window) -> RenderedFrame:
 
 
 def _cut(frame: Frame, window: Window) -> tuple[UInt8, UInt8 | None, Float32]:
-    """Window of image and label (views) and of depth (a float32 copy, far and unknown as `inf`).
+    """Copies of a window of image, label and depth (float32, far and unknown as `inf`).
 
-    A label of sky outranks a measured depth: sensors see leaves and wires before it.
+    Copies, because the kernels would be compiled once more for arrays that may not be written. A
+    label of sky outranks a measured depth: sensors see leaves and wires before it.
     """
     top, left, height, width = window
     part = (slice(top, top + height), slice(left, left + width))
     assert frame.depth_m is not None
     depth = _clean_depth(np.asarray(frame.depth_m[part]))
-    label = None if frame.label is None else np.ascontiguousarray(frame.label[part])
+    label = None if frame.label is None else np.array(frame.label[part], order="C")
     if label is not None:
         planes.raise_sky(label.reshape(-1), np.uint8(SKY), depth.reshape(-1))
-    return np.ascontiguousarray(frame.image[part]), label, depth
+    return np.array(frame.image[part], order="C"), label, depth
 
 
 def _clean_depth(depth: NDArray[Any]) -> Float32:
     """A float32 copy with far and unknown as `inf`."""
     if depth.dtype == np.float16:
         wide = np.empty(depth.shape, np.float32)
-        bits = np.ascontiguousarray(depth).view(np.uint16)
+        bits = np.array(depth, order="C").view(np.uint16)
         planes.widen_depth(bits.reshape(-1), wide.view(np.int32).reshape(-1))
         return wide
     copy = np.array(depth, np.float32, order="C")

@@ -40,30 +40,43 @@ def optical_depth(z, ray, up, fog, inverse_height, haze, precipitation, resolved
     return np.minimum(air + np.maximum(precipitation * z - resolved(z), 0) * norm, 60)
 
 
-def covariance(position, velocity, diameter, camera, *, compensate=True):
-    """Mean (2,), covariance (2, 2) and peak opacity of one particle on the picture."""
-    x, y, z = (float(v) for v in position)
+def gaussians(row, camera, *, compensate=True):
+    """Means (M, 2), covariance (2, 2) and peak opacity of one particle's splats on the picture."""
+    x, y, z = (float(v) for v in row[:3])
     fx, fy = camera.focal_px
     cx, cy = camera.principal_px
     jacobian = np.array([[fx / z, 0, -fx * x / z**2], [0, fy / z, -fy * y / z**2]])
     turning = np.cross(camera.angular_velocity_rad_per_s, [x, y, z])
-    sweep = jacobian @ (camera.exposure_s * (np.asarray(velocity, float) - turning))
-    sharp = (diameter / (2 * np.sqrt(2))) ** 2 * jacobian @ jacobian.T
+    sweep = jacobian @ (camera.exposure_s * (np.asarray(row[3:6], float) - turning))
+    xx, xy, xz, yy, yz, zz = row[6:12]
+    solid = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    sharp = jacobian @ solid @ jacobian.T
     blur = camera.aperture_m * fx * (1 / z - 1 / 6)
-    soft = sharp + np.outer(sweep, sweep) / 12 + np.eye(2) * (EPS2D + blur**2 / 16)
-    peak = np.sqrt(np.linalg.det(sharp) / np.linalg.det(soft)) if compensate else 1.0
-    return np.array([cx + fx * x / z, cy + fy * y / z]), soft, peak
+    filtered = np.eye(2) * (EPS2D + blur**2 / 16)
+    width2 = np.trace(sharp + filtered) / 2
+    parts = 1
+    if sweep @ sweep > 144 and width2 > 1:
+        parts = min(int(np.ceil(np.sqrt(sweep @ sweep / (9 * width2)))), 16)
+    spread = 1 / 12 if parts == 1 else 0.2
+    soft = sharp + filtered + np.outer(sweep, sweep) / parts**2 * spread
+    shrunk = np.sqrt(np.linalg.det(sharp) / np.linalg.det(soft)) / parts if compensate else 1.0
+    mean = np.array([cx + fx * x / z, cy + fy * y / z])
+    steps = (np.arange(parts) + 0.5) / parts - 0.5
+    return mean + steps[:, None] * sweep, soft, row[12] * shrunk
 
 
 def splat(light, transmittance, depth, particles, camera, colour_at, *, compensate=True):
-    """Blend particles (N, 7) far to near into linear light (H, W, 3), in place."""
+    """Blend particles (N, 13) far to near into linear light (H, W, 3), in place."""
     v, u = np.mgrid[: camera.height, : camera.width]
     for row in particles[np.argsort(-particles[:, 2], kind="stable")]:
-        centre, soft, peak = covariance(row[:3], row[3:6], row[6], camera, compensate=compensate)
+        means, soft, peak = gaussians(row, camera, compensate=compensate)
         peak = min(peak + CUT, 0.99)
-        offset = np.stack([u - centre[0], v - centre[1]], axis=-1)
-        power = np.einsum("hwi,ij,hwj->hw", offset, np.linalg.inv(soft), offset)
-        alpha = np.where(power <= 2 * np.log(peak / CUT), peak * np.exp(-power / 2), 0)
-        alpha = alpha * np.clip((depth - row[2]) / 0.2 + 0.5, 0, 1)
-        light += alpha[..., None] * (colour_at(row[:3]) - light)
-        transmittance *= 1 - alpha
+        if peak <= CUT:
+            continue
+        for mean in means:
+            offset = np.stack([u - mean[0], v - mean[1]], axis=-1)
+            power = np.einsum("hwi,ij,hwj->hw", offset, np.linalg.inv(soft), offset)
+            alpha = np.where(power <= 2 * np.log(peak / CUT), peak * np.exp(-power / 2), 0)
+            alpha = alpha * np.clip((depth - row[2]) * 5 + 0.5, 0, 1)
+            light += alpha[..., None] * (colour_at(row[:3]) - light)
+            transmittance *= 1 - alpha

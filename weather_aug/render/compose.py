@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -23,7 +22,7 @@ from weather_aug.render import planes
 from weather_aug.render.label import NEIGHBOURHOOD_PX, least_linear_contrast, readable_labels
 from weather_aug.render.light import Ambience, rain_colour, snow_colour
 from weather_aug.render.medium import Medium, Optics
-from weather_aug.render.project import BAND_ROWS, order_by_band, project
+from weather_aug.render.project import BAND_ROWS, far_to_near, project, split_by_band
 from weather_aug.render.shade import Tone, shade
 from weather_aug.taxonomy import SKY
 from weather_aug.weather import Weather, Wind
@@ -32,7 +31,8 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 
-FALLOFF_STEPS = 2048
+_EVEN = np.empty((0, 0), np.float32)
+"""No patches in the fog."""
 
 
 @dataclass(frozen=True)
@@ -256,6 +256,7 @@ def _medium(weather: Weather, fields: list[ParticleField]) -> Medium:
         weather.mist_per_km * 1e-3,
         sum(field.population.extinction_per_m for field in fields),
         FAR_M / DEPTH_BINS,
+        0.0,
     )
     return Medium(*(np.float32(v) for v in values))
 
@@ -281,7 +282,7 @@ def _shade(
     splats = _splats(frame, weather, ambience, window, fields, resolved, optics, medium, carried)
     _, _, height, width = window
     bands = -(-height // BAND_ROWS)
-    order, band_starts = order_by_band(splats, window, bands)
+    splats, band_starts = split_by_band(splats, window, bands)
     curve, matrix = tone(weather.overcast)
     out: dict[str, Any] = {
         "image": np.empty((3, height, width), np.uint8),
@@ -293,6 +294,7 @@ def _shade(
         image,
         depth,
         sky,
+        _EVEN,
         window,
         optics,
         medium,
@@ -303,12 +305,11 @@ def _shade(
             np.float32(weather.overcast),
             np.float32(max(float(ambience.sky @ LUMINANCE), 0.05)),
             np.float32(ZENITH_GAIN),
+            np.float32(0.0),
         ),
         airlight,
         splats,
-        order,
         band_starts,
-        _falloff(),
         np.float32(least_linear_contrast(ambience.airlight)),
         *out.values(),
     )
@@ -327,18 +328,32 @@ def _splats(
     medium: Medium,
     carried: Float32,
 ) -> Float32:
-    """(N, 13) screen-space particles of all fields that touch the window."""
+    """(N, 16) screen-space particles of all fields that touch the window."""
     light = ambience.under(weather.overcast)
-    airlight = ambience.airlight.astype(np.float32)
-    colours = {"rain": rain_colour, "snow": snow_colour}
-    found = []
-    for field, part in zip(fields, resolved, strict=True):
-        particles = field.particles(frame.camera, frame.time_s, part, window)
-        splats = np.empty((len(particles), 13), np.float32)
-        colour = colours[field.population.kind](light).astype(np.float32)
-        count = project(particles, optics, medium, carried, colour, airlight, window, splats)
-        found.append(splats[:count])
-    return np.concatenate(found) if found else np.empty((0, 13), np.float32)
+    colour_of = {"rain": rain_colour, "snow": snow_colour}
+    clouds = [
+        field.particles(frame.camera, frame.time_s, part, window)
+        for field, part in zip(fields, resolved, strict=True)
+    ]
+    if not clouds:
+        return np.empty((0, 16), np.float32)
+    particles = np.concatenate(clouds) if len(clouds) > 1 else clouds[0]
+    colours = np.array([colour_of[f.population.kind](light) for f in fields], np.float32)
+    order = far_to_near(particles)
+    inputs = (
+        # Sorted first, so that the long loop of `project` reads memory in order.
+        particles.take(order, axis=0),
+        order,
+        np.cumsum([len(cloud) for cloud in clouds]),
+        colours,
+        optics,
+        medium,
+        carried,
+        ambience.airlight.astype(np.float32),
+        window,
+        True,
+    )
+    return _projected(inputs, len(particles))
 
 
 def _trimmed(
@@ -366,8 +381,12 @@ def _trimmed(
     )
 
 
-@lru_cache(maxsize=1)
-def _falloff() -> Float32:
-    """exp(-x / 2) at the middle of each step of x in [0, 12.5)."""
-    x = (np.arange(FALLOFF_STEPS) + 0.5) * (12.5 / FALLOFF_STEPS)
-    return np.exp(-0.5 * x).astype(np.float32)
+def _projected(inputs: tuple[Any, ...], particles: int) -> Float32:
+    """Splats (M, 16) of `project`; long streaks are several."""
+    capacity = particles + particles // 8 + 64
+    while True:
+        splats = np.empty((capacity, 16), np.float32)
+        count = project(*inputs, splats)
+        if count <= capacity:
+            return splats[:count]
+        capacity = count

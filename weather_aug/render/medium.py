@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from weather_aug._compiled import compiled
+from weather_aug._compiled import compiled, inlined
 
 FAR_DEPTH_M = 60000.0
 """float16 ends here; a greater depth is the sky or beyond measure."""
@@ -42,6 +42,12 @@ class Medium(NamedTuple):
     haze_per_m: np.float32
     precipitation_per_m: np.float32
     resolved_step_m: np.float32
+    spray_per_m: np.float32
+    """At the camera's height."""
+
+
+SPRAY_HEIGHT_M = 0.5
+"""Height over which spray thins by a factor e."""
 
 
 @compiled
@@ -72,6 +78,17 @@ def _mean_of_thin_layer(heights):
     return np.float32(1.0) - heights * np.float32(0.5) * h
 
 
+@inlined
+def layer_share(heights):
+    """Mean of exp(-h) along a ray that climbs by h scale heights, (1 - exp(-h)) / h."""
+    one = np.float32(1.0)
+    lowest, highest, thin = np.float32(-8.0), np.float32(80.0), np.float32(0.05)
+    h = heights if heights > lowest else lowest
+    away = h if abs(h) >= thin else thin
+    share = (one - survival(away if away < highest else highest)) / away
+    return share if abs(h) >= thin else _mean_of_thin_layer(h)
+
+
 @compiled
 def path_optical_depth(z, ray_x, ray_y, optics, medium, resolved_depth):
     """Optical depth of the air from the camera to depth z along the ray (ray_x, ray_y, 1)."""
@@ -82,54 +99,55 @@ def path_optical_depth(z, ray_x, ray_y, optics, medium, resolved_depth):
         sine = max(rise / norm, np.float32(0.05))
         z = min(np.float32(1000.0) / sine, np.float32(20000.0)) / norm
     path_m = z * norm
-    heights = max(z * rise * medium.inverse_height_per_m, np.float32(-8.0))
-    if abs(heights) < np.float32(0.05):
-        share = _mean_of_thin_layer(heights)
-    else:
-        share = (one - survival(min(heights, np.float32(80.0)))) / heights
+    fog = layer_share(z * rise * medium.inverse_height_per_m)
+    spray = layer_share(z * rise * np.float32(1.0 / SPRAY_HEIGHT_M))
     last = np.int32(resolved_depth.shape[0] - 1)
     # Compared as a float first: the sky's bin does not fit an integer's range on every machine.
     position = min(z * (one / medium.resolved_step_m), np.float32(last))
     resolved = resolved_depth[np.int32(position)]
-    tau = (medium.fog_per_m * share + medium.haze_per_m) * path_m
+    tau = (medium.fog_per_m * fog + medium.spray_per_m * spray + medium.haze_per_m) * path_m
     tau += max(medium.precipitation_per_m * z - resolved, zero) * norm
     return min(tau, np.float32(60.0))
 
 
 @compiled
-def transmittance_row(depth, ray_x, ray_y, optics, medium, resolved_depth, tau, slant, out):
-    """`path_optical_depth` and `survival` of one row, in loops that the compiler can vectorise."""
+def transmittance_row(
+    depth, fog_share, ray_x, ray_y, optics, medium, resolved_depth, tau, slant, out
+):
+    """`path_optical_depth` and `survival` of one row, in loops that the compiler can vectorise.
+
+    Args:
+        depth: (W,) metres, `inf` for far.
+        fog_share: (W,) factor on the fog's optical depth, or (0,) for 1.
+        ray_x: (W,) tangents.
+        ray_y: Tangent.
+        optics: Camera.
+        medium: Air.
+        resolved_depth: Optical depth of resolved particles by depth.
+        tau: (W,) out: optical depth.
+        slant: (W,) scratch.
+        out: (W,) out: transmittance.
+    """
     zero, one = np.float32(0.0), np.float32(1.0)
-    across = one + ray_y * ray_y
-    rise_y = optics.up_y * ray_y + optics.up_z
-    far, nearly_flat = np.float32(FAR_DEPTH_M), np.float32(0.05)
-    layer_m, longest_m = np.float32(1000.0), np.float32(20000.0)
     width = depth.shape[0]
+    _reach_row(depth, ray_x, ray_y, optics, slant, out)
     for x in range(width):
-        norm = np.sqrt(across + ray_x[x] * ray_x[x])
-        rise = optics.up_x * ray_x[x] + rise_y
-        sine = rise / norm
-        sine = sine if sine > nearly_flat else nearly_flat
-        beyond_m = layer_m / sine
-        beyond_m = beyond_m if beyond_m < longest_m else longest_m
-        z = depth[x]
-        z = z if z < far else beyond_m / norm
-        slant[x] = norm
-        out[x] = z
-        tau[x] = medium.haze_per_m * z * norm
-    if medium.inverse_height_per_m == zero:
-        for x in range(width):
-            tau[x] += medium.fog_per_m * out[x] * slant[x]
-    else:
-        lowest, highest, thin = np.float32(-8.0), np.float32(80.0), np.float32(0.05)
+        tau[x] = medium.fog_per_m * out[x] * slant[x]
+    rise_y = optics.up_y * ray_y + optics.up_z
+    if medium.inverse_height_per_m > zero:
         for x in range(width):
             rise = optics.up_x * ray_x[x] + rise_y
-            heights = out[x] * rise * medium.inverse_height_per_m
-            heights = heights if heights > lowest else lowest
-            away = heights if abs(heights) >= thin else thin
-            share = (one - survival(away if away < highest else highest)) / away
-            share = share if abs(heights) >= thin else _mean_of_thin_layer(heights)
-            tau[x] += medium.fog_per_m * share * out[x] * slant[x]
+            tau[x] *= layer_share(out[x] * rise * medium.inverse_height_per_m)
+    if fog_share.shape[0] > 0:
+        for x in range(width):
+            tau[x] *= fog_share[x]
+    for x in range(width):
+        tau[x] += medium.haze_per_m * out[x] * slant[x]
+    if medium.spray_per_m > zero:
+        for x in range(width):
+            rise = optics.up_x * ray_x[x] + rise_y
+            spray = layer_share(out[x] * rise * np.float32(1.0 / SPRAY_HEIGHT_M))
+            tau[x] += medium.spray_per_m * spray * out[x] * slant[x]
     if medium.precipitation_per_m > zero:
         last = np.float32(resolved_depth.shape[0] - 1)
         per_metre = one / medium.resolved_step_m
@@ -140,4 +158,29 @@ def transmittance_row(depth, ray_x, ray_y, optics, medium, resolved_depth, tau, 
             tau[x] += (rest if rest > zero else zero) * slant[x]
     most = np.float32(60.0)
     for x in range(width):
-        out[x] = survival(tau[x] if tau[x] < most else most)
+        tau[x] = tau[x] if tau[x] < most else most
+        out[x] = survival(tau[x])
+
+
+@inlined
+def _reach_row(depth, ray_x, ray_y, optics, slant, reach):
+    """Length of a ray per metre of depth, and the depth at which each pixel's air ends."""
+    one = np.float32(1.0)
+    far, nearly_flat = np.float32(FAR_DEPTH_M), np.float32(0.05)
+    layer_m, longest_m = np.float32(1000.0), np.float32(20000.0)
+    across = one + ray_y * ray_y
+    rise_y = optics.up_y * ray_y + optics.up_z
+    deepest = np.float32(0.0)
+    for x in range(depth.shape[0]):
+        slant[x] = np.sqrt(across + ray_x[x] * ray_x[x])
+        reach[x] = depth[x]
+    for x in range(depth.shape[0]):
+        deepest = max(deepest, depth[x])
+    if deepest < far:
+        return
+    for x in range(depth.shape[0]):
+        sine = (optics.up_x * ray_x[x] + rise_y) / slant[x]
+        sine = sine if sine > nearly_flat else nearly_flat
+        beyond_m = layer_m / sine
+        beyond_m = beyond_m if beyond_m < longest_m else longest_m
+        reach[x] = depth[x] if depth[x] < far else beyond_m / slant[x]

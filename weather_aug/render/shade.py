@@ -12,7 +12,7 @@ import numpy as np
 from weather_aug._compiled import compiled
 from weather_aug.render.medium import transmittance_row
 from weather_aug.render.project import BAND_ROWS
-from weather_aug.render.splat import blend_splat
+from weather_aug.render.tile import TILE_FLOATS, blend_band, cover_splat
 
 
 class Tone(NamedTuple):
@@ -21,6 +21,8 @@ class Tone(NamedTuple):
     overcast: np.float32
     sky_luminance: np.float32
     zenith_gain: np.float32
+    encoded: np.float32
+    """1 where colours are blended as they are stored, in sRGB; 0 in linear light."""
 
 
 @compiled
@@ -28,6 +30,7 @@ def shade(
     image,
     depth,
     sky,
+    fog_share,
     window,
     optics,
     medium,
@@ -37,9 +40,7 @@ def shade(
     tone,
     airlight,
     splats,
-    order,
     band_starts,
-    falloff,
     least_contrast,
     out,
     through,
@@ -52,18 +53,17 @@ def shade(
         image: (H, W, 3) uint8 of the window.
         depth: (H, W) float32 z-depth of the window, `inf` for far.
         sky: (H, W) bool of the window.
+        fog_share: (H, W) float32, optical depth of the fog over that of even fog; (0, 0) if even.
         window: (top, left, height, width) in the whole picture.
         optics: Camera of the whole picture.
         medium: Air.
         resolved_depth: Optical depth of resolved particles by depth.
-        linear: (256,) float32 toned linear light by sRGB level.
+        linear: (256,) float32 toned light by sRGB level.
         matrix: (3, 3) float32 colour matrix after it.
         tone: Sky.
         airlight: (3,) float32.
-        splats: (N, 13) float32.
-        order: Splat indices by band.
-        band_starts: (bands + 1,).
-        falloff: exp(-x / 2) for x in [0, 12.5), float32.
+        splats: (M, 16) float32, band by band.
+        band_starts: (bands + 1,) where each band's splats start.
         least_contrast: Linear difference from the airlight that can just be seen.
         out: (3, H, W) uint8 out.
         through: (H, W) float32 out: transmittance of air and particles.
@@ -77,8 +77,12 @@ def shade(
         ray_x[x] = (np.float32(x + left) - optics.cx) / optics.fx
     # Red, green, blue, transmittance and depth of a band's rows side by side. The odd stride keeps
     # them apart in the cache: planes of equal page offset would evict each other at every pixel.
+    # It is a multiple of 4 beyond the width, so that tiles fit.
     stride = (width + 15) // 16 * 16 + 80
-    planes = np.empty((BAND_ROWS, 5, stride), np.float32)
+    planes = np.zeros((BAND_ROWS, 5, stride), np.float32)
+    tiles = np.empty((BAND_ROWS // 4, stride // 4, TILE_FLOATS), np.float32)
+    even = np.empty(0, np.float32)
+    patchy = fog_share.shape[0] > 0
     gap = np.empty((BAND_ROWS, width), np.float32)
     tau = np.empty(width, np.float32)
     slant = np.empty(width, np.float32)
@@ -92,8 +96,9 @@ def shade(
             red, green, blue = planes[k, 0, :width], planes[k, 1, :width], planes[k, 2, :width]
             clear = planes[k, 3, :width]
             planes[k, 4, :width] = depth[y]
+            share = fog_share[y] if patchy else even
             transmittance_row(
-                depth[y], ray_x, ray_y, optics, medium, resolved_depth, tau, slant, clear
+                depth[y], share, ray_x, ray_y, optics, medium, resolved_depth, tau, slant, clear
             )
             _decode_row(image[y], linear, red, green, blue)
             if overcast:
@@ -101,12 +106,18 @@ def shade(
                     sky[y], ray_x, ray_y, optics, matrix, tone, airlight, red, green, blue
                 )
             _fog_row(clear, airlight, red, green, blue, gap[k])
-        for k in range(band_starts[band], band_starts[band + 1]):
-            blend_splat(splats[order[k]], (y0, y1), window, falloff, planes, covered)
+        mine = splats[band_starts[band] : band_starts[band + 1]]
+        blend_band(mine, window, y0, planes, tiles)
+        for i in range(mine.shape[0]):
+            if mine[i, 11] > np.float32(0.0):
+                cover_splat(mine[i], (y0, y1), window, planes, covered)
         for y in range(y0, y1):
             k = y - y0
             for channel in range(3):
-                encode_row(planes[k, channel, :width])
+                if tone.encoded > np.float32(0.0):
+                    _level_row(planes[k, channel, :width])
+                else:
+                    encode_row(planes[k, channel, :width])
                 _quantise_row(planes[k, channel, :width], out[channel, y])
             through[y] = planes[k, 3, :width]
             _distinct_row(gap[k], through[y], least_contrast, distinct[y])
@@ -179,6 +190,17 @@ def encode_row(light):
         p = np.float32(-0.0401096) + s * p
         p = p if v > np.float32(0.0031308) else np.float32(12.92) * v
         light[x] = p * np.float32(255.0) + np.float32(0.5)
+
+
+@compiled
+def _level_row(light):
+    """Turn colours that are sRGB already into levels plus one half, in place."""
+    zero, one = np.float32(0.0), np.float32(1.0)
+    for x in range(light.shape[0]):
+        v = light[x]
+        v = v if v > zero else zero
+        v = v if v < one else one
+        light[x] = v * np.float32(255.0) + np.float32(0.5)
 
 
 @compiled

@@ -19,7 +19,7 @@ from weather_aug.render.compose import (
     warm_up,
 )
 from weather_aug.render.light import Ambience, airlight_from_sky, ambience_of
-from weather_aug.render.project import split_by_band, project
+from weather_aug.render.project import project, sorted_in_blocks, split_by_band
 from weather_aug.render.shade import shade
 from weather_aug.scene.policy import weather_of
 from weather_aug.taxonomy import SKY
@@ -267,7 +267,7 @@ def test_half_precision_depth_is_widened_exactly():
 def test_warm_up_leaves_nothing_to_compile():
     """Else each worker of a fresh machine compiles for itself, all at once."""
     warm_up()
-    kernels = (shade, project, split_by_band, planes.widen_depth, planes.clean_depth)
+    kernels = (shade, project, sorted_in_blocks, split_by_band, planes.widen_depth, planes.clean_depth)
     kernels += (planes.raise_sky, planes.read_labels, scatter, solve_reach)
     before = [len(kernel.signatures) for kernel in kernels]
     frame = street_frame()

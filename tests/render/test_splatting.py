@@ -11,7 +11,7 @@ from weather_aug.particles import statistics
 from weather_aug.render import compose
 from weather_aug.render.compose import RenderOptions, render
 from weather_aug.render.medium import Medium
-from weather_aug.render.project import BAND_ROWS, FAINTEST, far_to_near, log, split_by_band
+from weather_aug.render.project import BAND_ROWS, FAINTEST, log, sorted_in_blocks, split_by_band
 from weather_aug.render.project import project as project_kernel
 from weather_aug.render.shade import Tone, shade
 from weather_aug.weather import Weather
@@ -37,12 +37,10 @@ def project(records, camera, window=None):
     window = window or (0, 0, camera.height, camera.width)
     white = np.ones((1, 3), np.float32)
     optics = compose._optics(camera, UP)
-    order = far_to_near(records)
-    splats = np.empty((20 * len(records), 16), np.float32)
-    count = project_kernel(
-        records[order],
-        order,
-        np.array([len(records)]),
+    blocks, kinds = sorted_in_blocks(np.asarray(records, np.float32), np.array([len(records)]))
+    return project_kernel(
+        blocks,
+        kinds,
         white,
         optics,
         CLEAR_AIR,
@@ -50,9 +48,7 @@ def project(records, camera, window=None):
         white[0],
         window,
         True,
-        splats,
     )
-    return splats[:count]
 
 
 def transmittance(particles, camera, depth_m=1000.0):

@@ -22,7 +22,7 @@ from weather_aug.render import planes
 from weather_aug.render.label import NEIGHBOURHOOD_PX, least_linear_contrast, readable_labels
 from weather_aug.render.light import Ambience, rain_colour, snow_colour
 from weather_aug.render.medium import Medium, Optics
-from weather_aug.render.project import BAND_ROWS, far_to_near, project, split_by_band
+from weather_aug.render.project import BAND_ROWS, project, sorted_in_blocks, split_by_band
 from weather_aug.render.shade import Tone, shade
 from weather_aug.taxonomy import SKY
 from weather_aug.weather import Weather, Wind
@@ -335,25 +335,16 @@ def _splats(
         field.particles(frame.camera, frame.time_s, part, window)
         for field, part in zip(fields, resolved, strict=True)
     ]
-    if not clouds:
+    if not any(len(cloud) for cloud in clouds):
         return np.empty((0, 16), np.float32)
     particles = np.concatenate(clouds) if len(clouds) > 1 else clouds[0]
     colours = np.array([colour_of[f.population.kind](light) for f in fields], np.float32)
-    order = far_to_near(particles)
-    inputs = (
-        # Sorted first, so that the long loop of `project` reads memory in order.
-        particles.take(order, axis=0),
-        order,
-        np.cumsum([len(cloud) for cloud in clouds]),
-        colours,
-        optics,
-        medium,
-        carried,
-        ambience.airlight.astype(np.float32),
-        window,
-        True,
+    blocks, kinds = sorted_in_blocks(particles, np.cumsum([len(cloud) for cloud in clouds]))
+    airlight = ambience.airlight.astype(np.float32)
+    splats: Float32 = project(
+        blocks, kinds, colours, optics, medium, carried, airlight, window, True
     )
-    return _projected(inputs, len(particles))
+    return splats
 
 
 def _trimmed(
@@ -379,14 +370,3 @@ def _trimmed(
         transmittance=cut(shot["transmittance"][part]),
         depth=cut(depth[part]),
     )
-
-
-def _projected(inputs: tuple[Any, ...], particles: int) -> Float32:
-    """Splats (M, 16) of `project`; long streaks are several."""
-    capacity = particles + particles // 8 + 64
-    while True:
-        splats = np.empty((capacity, 16), np.float32)
-        count = project(*inputs, splats)
-        if count <= capacity:
-            return splats[:count]
-        capacity = count

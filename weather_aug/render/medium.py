@@ -89,25 +89,33 @@ def layer_share(heights):
     return share if abs(h) >= thin else _mean_of_thin_layer(h)
 
 
-@compiled
-def path_optical_depth(z, ray_x, ray_y, optics, medium, resolved_depth):
-    """Optical depth of the air from the camera to depth z along the ray (ray_x, ray_y, 1)."""
+@inlined
+def carried_at(z, resolved_depth, medium):
+    """Optical depth of drawn particles, on the axis, up to depth z."""
+    last = np.float32(resolved_depth.shape[0] - 1)
+    position = z * (np.float32(1.0) / medium.resolved_step_m)
+    # Compared as a float first: the sky's bin does not fit an integer's range on every machine.
+    position = position if position < last else last
+    return resolved_depth[np.int32(position)]
+
+
+@inlined
+def near_optical_depth(z, ray_x, ray_y, optics, medium, carried):
+    """Optical depth of the air from the camera to a finite depth z along the ray (x, y, 1).
+
+    `carried` is what drawn particles carry of it on the axis. Patches in the fog are left out.
+    """
     zero, one = np.float32(0.0), np.float32(1.0)
     norm = np.sqrt(one + ray_x * ray_x + ray_y * ray_y)
     rise = optics.up_x * ray_x + optics.up_y * ray_y + optics.up_z
-    if z >= np.float32(FAR_DEPTH_M):
-        sine = max(rise / norm, np.float32(0.05))
-        z = min(np.float32(1000.0) / sine, np.float32(20000.0)) / norm
-    path_m = z * norm
     fog = layer_share(z * rise * medium.inverse_height_per_m)
     spray = layer_share(z * rise * np.float32(1.0 / SPRAY_HEIGHT_M))
-    last = np.int32(resolved_depth.shape[0] - 1)
-    # Compared as a float first: the sky's bin does not fit an integer's range on every machine.
-    position = min(z * (one / medium.resolved_step_m), np.float32(last))
-    resolved = resolved_depth[np.int32(position)]
-    tau = (medium.fog_per_m * fog + medium.spray_per_m * spray + medium.haze_per_m) * path_m
-    tau += max(medium.precipitation_per_m * z - resolved, zero) * norm
-    return min(tau, np.float32(60.0))
+    rest = medium.precipitation_per_m * z - carried
+    rest = rest if rest > zero else zero
+    tau = medium.fog_per_m * fog + medium.spray_per_m * spray + medium.haze_per_m
+    tau = (tau * z + rest) * norm
+    most = np.float32(60.0)
+    return tau if tau < most else most
 
 
 @compiled

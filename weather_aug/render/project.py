@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from weather_aug._compiled import compiled, inlined
-from weather_aug.render.medium import path_optical_depth, survival
+from weather_aug.render.medium import carried_at, near_optical_depth, survival
 
 BAND_ROWS = 16
 """Rows that are shaded, splatted and encoded together, while they are in the cache."""
@@ -17,10 +17,7 @@ FAINTEST = 1.0 / 255.0
 
 
 @compiled
-def project(
-    particles, order, kinds, colours, optics, medium, resolved_depth, airlight, window, compensate,
-    splats,
-):
+def project(blocks, kinds, colours, optics, medium, resolved_depth, airlight, window, compensate):
     """Turn particles into screen-space Gaussians, keeping those that touch the window.
 
     The covariance is that of the particle, projected, plus q q^T / 12 for a uniform sweep q, plus
@@ -30,9 +27,8 @@ def project(
     wide is drawn in parts, because one Gaussian is no flat streak.
 
     Args:
-        particles: (N, 13) float32 as `ParticleField.particles` returns them, far to near.
-        order: (N,) index that each particle had before it was sorted.
-        kinds: (K,) where the particles of each kind ended then.
+        blocks: (B, 13, 16) float32 particles, as `sorted_in_blocks` returns them.
+        kinds: (B, 16) uint8, the kind of each, 255 where a block is not full.
         colours: (K, 3) float32 of each kind.
         optics: Camera.
         medium: Air.
@@ -41,103 +37,152 @@ def project(
         window: (top, left, height, width).
         compensate: Whether the peak falls with the blur; False for the classic 3D Gaussian splat,
             which only grows.
-        splats: (M, 16) float32 out: u, v, conic a b c, reach^2, peak, depth, rgb, covers, half
-            height, half width of a row, lean of the middles of the rows, 0.
 
     Returns:
-        Number of splats; those beyond M are counted, not written.
+        (M, 16) float32 splats: u, v, conic a b c, reach^2, peak, depth, rgb, covers, half height,
+        half width of a row, lean of the middles of the rows, 0.
     """
+    capacity = blocks.shape[0] * 18 + 64
+    splats = np.empty((capacity, 16), np.float32)
+    shape = np.empty(_FIELDS * 16, np.float32)
     count = 0
-    one = np.float32(1.0)
-    top, left, height, width = window
-    capacity = splats.shape[0]
-    large_area = np.float32(1e-3) * optics.area_px
-    for n in range(particles.shape[0]):
-        p = particles[n]
-        x, y, z = p[0], p[1], p[2]
+    for i in range(blocks.shape[0]):
+        block = blocks[i].reshape(13 * 16)
+        _shape(block, optics, medium, resolved_depth, compensate, shape)
+        for lane in range(16):
+            if kinds[i, lane] == 255 or not _touches(shape, lane, window):
+                continue
+            parts = np.int64(shape[_PARTS * 16 + lane])
+            if count + parts > capacity:
+                capacity += capacity // 2
+                splats = _grown(splats, count, capacity)
+            count = _emit(shape, lane, parts, block[2 * 16 + lane], splats, count)
+            _paint(shape, lane, parts, colours[kinds[i, lane]], airlight, splats, count)
+    return splats[:count]
+
+
+@compiled
+def _shape(p, optics, medium, resolved_depth, compensate, out):
+    """Footprints of 16 particles, all at once: without branches, so that they go in one vector."""
+    one, two = np.float32(1.0), np.float32(2.0)
+    t = optics.exposure_s
+    large_area = np.float32(1e-3 / np.pi) * optics.area_px
+    # Looked up beforehand: a look-up in the long loop would keep it from being one vector.
+    for k in range(16):
+        out[112 + k] = carried_at(p[32 + k], resolved_depth, medium)
+    for k in range(16):
+        x, y, z = p[k], p[16 + k], p[32 + k]
         inverse = one / z
         tx, ty = x * inverse, y * inverse
         sx, sy = optics.fx * inverse, optics.fy * inverse
-        t = optics.exposure_s
-        ux = t * (p[3] - (optics.turn_y * z - optics.turn_z * y))
-        uy = t * (p[4] - (optics.turn_z * x - optics.turn_x * z))
-        uz = t * (p[5] - (optics.turn_x * y - optics.turn_y * x))
+        ux = t * (p[48 + k] - (optics.turn_y * z - optics.turn_z * y))
+        uy = t * (p[64 + k] - (optics.turn_z * x - optics.turn_x * z))
+        uz = t * (p[80 + k] - (optics.turn_x * y - optics.turn_y * x))
         qx, qy = sx * (ux - tx * uz), sy * (uy - ty * uz)
         # J Sigma J^T, with J = diag(sx, sy) [[1, 0, -tx], [0, 1, -ty]].
-        xz, yz = p[8] - tx * p[11], p[10] - ty * p[11]
-        a0 = sx * sx * (p[6] - tx * p[8] - tx * xz)
-        b0 = sx * sy * (p[7] - ty * p[8] - tx * yz)
-        c0 = sy * sy * (p[9] - ty * p[10] - ty * yz)
-        det_sharp = max(a0 * c0 - b0 * b0, np.float32(1e-20))
+        xx, xy, xz = p[96 + k], p[112 + k], p[128 + k]
+        yy, yz, zz = p[144 + k], p[160 + k], p[176 + k]
+        a0 = sx * sx * (xx - tx * (two * xz - tx * zz))
+        b0 = sx * sy * (xy - ty * xz - tx * (yz - ty * zz))
+        c0 = sy * sy * (yy - ty * (two * yz - ty * zz))
+        sharp = a0 * c0 - b0 * b0
+        sharp = sharp if sharp > np.float32(1e-20) else np.float32(1e-20)
         blur = optics.aperture_m * optics.fx * (inverse - np.float32(1.0 / 6.0))
         soft = np.float32(0.3) + blur * blur * np.float32(0.0625)
-        parts = _parts(qx * qx + qy * qy, a0 + c0 + np.float32(2.0) * soft)
-        share = one / np.float32(parts)
-        qx, qy = qx * share, qy * share
+        parts = _parts(qx * qx + qy * qy, np.float32(0.5) * (a0 + c0) + soft)
         # Parts overlap: as wide as 1/12 says, their sum would ripple by a third.
-        spread = np.float32(1.0 / 12.0) if parts == 1 else np.float32(0.2)
-        a, b, c, det = _blurred(a0, b0, c0, det_sharp, soft, qx, qy, spread)
-        peak = p[12]
-        if compensate:
-            peak = peak * np.sqrt(det_sharp / det) * share
+        spread = np.float32(1.0 / 12.0) if parts == one else np.float32(0.2)
+        share = one / parts
+        qx, qy = qx * share, qy * share
+        a, c = a0 + soft + spread * qx * qx, c0 + soft + spread * qy * qy
+        b = b0 + spread * qx * qy
+        # Term by term, because a c - b b cancels to nothing for a sweep of many pixels.
+        swept = (a0 + soft) * qy * qy + (c0 + soft) * qx * qx - two * b0 * qx * qy
+        swept = swept if swept > np.float32(0.0) else np.float32(0.0)
+        det = sharp + soft * (a0 + c0 + soft) + spread * swept
+        shrunk = np.sqrt(sharp / det) * share if compensate else one
         # What the cut of the footprint takes away, so that the sum over the pixels is right.
-        peak = min(peak + np.float32(FAINTEST), np.float32(0.99))
-        reach2 = np.float32(2.0) * log(peak * np.float32(1.0 / FAINTEST))
-        if not reach2 > np.float32(0.0):
-            continue
-        u, v = optics.cx + optics.fx * tx, optics.cy + optics.fy * ty
-        half_u, half_v = np.sqrt(reach2 * a), np.sqrt(reach2 * c)
-        aside = np.float32(0.5) * np.float32(parts - 1)
-        span_u, span_v = half_u + aside * abs(qx), half_v + aside * abs(qy)
-        if u + span_u < left or u - span_u > left + width - 1:
-            continue
-        if v + span_v < top or v - span_v > top + height - 1:
-            continue
-        through = survival(path_optical_depth(z, tx, ty, optics, medium, resolved_depth))
-        kind = 0
-        while order[n] >= kinds[kind]:
-            kind += 1
-        covers = np.float32(np.pi) * reach2 * np.sqrt(det) * np.float32(parts) > large_area
-        for k in range(parts):
-            if count < capacity:
-                row = splats[count]
-                step = np.float32(k) - aside
-                row[0], row[1] = u + step * qx, v + step * qy
-                row[2], row[3], row[4] = c / det, -b / det, a / det
-                row[5], row[6], row[7] = reach2, peak, z
-                for channel in range(3):
-                    veil = airlight[channel]
-                    row[8 + channel] = veil + through * (colours[kind, channel] - veil)
-                row[11] = one if covers else np.float32(0.0)
-                # A hundredth of a pixel more, so that rounding cuts no pixel off.
-                row[12] = half_v + np.float32(0.01)
-                row[13] = np.sqrt(reach2 * det / c) + np.float32(0.01)
-                row[14] = b / c
-                row[15] = np.float32(0.0)
-            count += 1
+        peak = p[192 + k] * shrunk + np.float32(FAINTEST)
+        peak = peak if peak < np.float32(0.99) else np.float32(0.99)
+        reach2 = two * log(peak * np.float32(1.0 / FAINTEST))
+        drawn = reach2 if reach2 > np.float32(0.0) else np.float32(0.0)
+        aside = np.float32(0.5) * (parts - one)
+        half_v = np.sqrt(drawn * c)
+        over = drawn * np.sqrt(det) * parts > large_area
+        tau = near_optical_depth(z, tx, ty, optics, medium, out[112 + k])
+        out[k] = optics.cx + optics.fx * tx
+        out[16 + k] = optics.cy + optics.fy * ty
+        out[32 + k], out[48 + k], out[64 + k] = c / det, -b / det, a / det
+        out[80 + k], out[96 + k] = reach2, peak
+        out[112 + k] = survival(tau)
+        out[128 + k] = one if over else np.float32(0.0)
+        # A hundredth of a pixel more, so that rounding cuts no pixel off.
+        out[144 + k] = half_v + np.float32(0.01)
+        out[160 + k] = np.sqrt(drawn * det / c) + np.float32(0.01)
+        out[176 + k] = b / c
+        out[192 + k], out[208 + k] = qx, qy
+        out[224 + k] = parts
+        out[240 + k] = np.sqrt(drawn * a) + aside * abs(qx)
+        out[256 + k] = half_v + aside * abs(qy)
+
+
+_PARTS = 14
+_FIELDS = 17
+
+
+@inlined
+def _touches(shape, lane, window):
+    """Whether any part of a footprint is seen in the window."""
+    top, left, height, width = window
+    u, v = shape[lane], shape[16 + lane]
+    span_u, span_v = shape[240 + lane], shape[256 + lane]
+    across = (u + span_u >= left) & (u - span_u <= left + width - 1)
+    down = (v + span_v >= top) & (v - span_v <= top + height - 1)
+    return across & down & (shape[80 + lane] > np.float32(0.0))
+
+
+@inlined
+def _emit(shape, lane, parts, z, splats, count):
+    """Write the parts of one footprint, all but their colour; returns the new count."""
+    aside = np.float32(0.5) * np.float32(parts - 1)
+    for part in range(parts):
+        row = splats[count]
+        step = np.float32(part) - aside
+        row[0] = shape[lane] + step * shape[192 + lane]
+        row[1] = shape[16 + lane] + step * shape[208 + lane]
+        for field in range(2, 7):
+            row[field] = shape[16 * field + lane]
+        row[7] = z
+        row[11], row[12] = shape[128 + lane], shape[144 + lane]
+        row[13], row[14], row[15] = shape[160 + lane], shape[176 + lane], np.float32(0.0)
+        count += 1
     return count
 
 
 @inlined
-def _parts(sweep2, spread2):
-    """Into how many parts a sweep is cut, from its squared length and twice the mean variance."""
-    variance = np.float32(0.5) * spread2
-    if sweep2 <= np.float32(144.0) or variance <= np.float32(1.0):
-        return 1
-    return min(np.int64(np.ceil(np.sqrt(sweep2 / (np.float32(9.0) * variance)))), MOST_PARTS)
+def _paint(shape, lane, parts, colour, airlight, splats, count):
+    """Colour the last `parts` splats: a particle is seen through the air in front of it."""
+    through = shape[112 + lane]
+    for n in range(count - parts, count):
+        for channel in range(3):
+            veil = airlight[channel]
+            splats[n, 8 + channel] = veil + through * (colour[channel] - veil)
 
 
 @inlined
-def _blurred(a0, b0, c0, det_sharp, soft, qx, qy, spread):
-    """Covariance (a, b, c) with filter and `spread` q q^T, and its determinant.
+def _parts(sweep2, variance):
+    """Into how many parts a sweep is cut, from its squared length and the mean variance."""
+    one = np.float32(1.0)
+    wanted = np.ceil(np.sqrt(sweep2 / (np.float32(9.0) * variance)))
+    wanted = wanted if wanted < np.float32(MOST_PARTS) else np.float32(MOST_PARTS)
+    return wanted if (sweep2 > np.float32(144.0)) & (variance > one) else one
 
-    The determinant term by term, because a c - b b cancels to nothing for a sweep of many pixels.
-    """
-    a, b = a0 + soft + qx * qx * spread, b0 + qx * qy * spread
-    c = c0 + soft + qy * qy * spread
-    swept = (a0 + soft) * qy * qy + (c0 + soft) * qx * qx - np.float32(2.0) * b0 * qx * qy
-    det = det_sharp + soft * (a0 + c0 + soft) + spread * max(swept, np.float32(0.0))
-    return a, b, c, det
+
+@compiled
+def _grown(splats, count, capacity):
+    wider = np.empty((capacity, 16), np.float32)
+    wider[:count] = splats[:count]
+    return wider
 
 
 @inlined
@@ -153,6 +198,39 @@ def log(x):
     series = np.float32(1.0 / 5.0) + s2 * np.float32(1.0 / 7.0)
     series = one + s2 * (np.float32(1.0 / 3.0) + s2 * series)
     return np.float32(16.0) * s * series
+
+
+@compiled
+def sorted_in_blocks(particles, ends):
+    """Particles far to near, in blocks of 16 that a vector can take at once.
+
+    A counting sort by inverse depth, from 0 (far) to 2 (the near limit of 0.5 m), so that equal
+    depths keep the field's own order in any window.
+
+    Args:
+        particles: (N, 13) float32.
+        ends: (K,) where the particles of each kind end.
+
+    Returns:
+        (B, 13, 16) float32 and the kinds (B, 16) uint8; the last block is filled up with copies of
+        the nearest particle whose kind is 255.
+    """
+    order = _far_to_near(particles)
+    n = particles.shape[0]
+    count = (n + 15) // 16
+    blocks = np.empty((count, 13, 16), np.float32)
+    kinds = np.full((count, 16), 255, np.uint8)
+    for k in range(16 * count):
+        i = order[min(k, n - 1)]
+        block, lane = k >> 4, k & 15
+        for field in range(13):
+            blocks[block, field, lane] = particles[i, field]
+        if k < n:
+            kind = 0
+            while i >= ends[kind]:
+                kind += 1
+            kinds[block, lane] = kind
+    return blocks, kinds
 
 
 @compiled
@@ -194,12 +272,7 @@ def _bands_of(splats, i, top, height):
 
 
 @compiled
-def far_to_near(particles):
-    """Indices (N,) int32 of particles (N, 13) from far to near.
-
-    A counting sort by inverse depth, from 0 (far) to 2 (the near limit of 0.5 m), so that equal
-    depths keep the field's own order in any window.
-    """
+def _far_to_near(particles):
     n = particles.shape[0]
     keys = np.empty(n, np.int32)
     starts = np.zeros(DEPTH_KEYS + 1, np.int64)

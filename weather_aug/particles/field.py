@@ -102,31 +102,37 @@ class ParticleField:
         sway_m = self._sway_m()
         sway_m_per_s = sway_m * population.sway_rad_per_s
         reach_m = np.array(resolved.reach_m)
-        speed = np.linalg.norm(relative, axis=1) + np.abs(sway_m_per_s).sum(axis=1)
-        view, pad_m = _padded_view(camera, window, reach_m, speed, population)
-        tumbling = population.tumbles
+        speed = np.linalg.norm(relative, axis=1) + sway_m_per_s.sum(axis=1)
+        tangents, pad_m = _padded_view(camera, window, reach_m, speed, population)
+        fade_per_m = (1.0 / (FADE_SHARE * np.maximum(reach_m, NEAR_M))).astype(np.float32)
         inputs = (
             _class_keys(population.kind, self.seed, len(pad_m)),
             _counts(tuple(population.density_per_m3 * population.cell_m**3)),
             population.cell_m,
             field_from_camera[:3, 3] - self._carried_m(time_s),
-            reach_m,
-            (1.0 / (FADE_SHARE * np.maximum(reach_m, NEAR_M))).astype(np.float32),
-            NEAR_M,
-            NEAR_FULL_M,
-            *_planes_and_bounds(turned, view, reach_m, pad_m, sway_m, population.cell_m),
-            np.ascontiguousarray(turned.T),
-            view,
-            pad_m,
-            _SINE,
-            sway_m,
-            np.mod(population.sway_rad_per_s * time_s / (2 * np.pi), 1.0),
-            self.axes_world[:2] @ turned,
-            population.diameters_m.astype(np.float32),
-            (relative @ rotation).astype(np.float32),
-            (sway_m_per_s[:, :, None] * (self.axes_world[:2] @ rotation)).astype(np.float32),
-            shapes_in(turned) if tumbling else _NO_SHAPES,
-            shape_turns(time_s) if tumbling else _NO_TURNS,
+            *_planes_and_bounds(turned, tangents, reach_m, pad_m, sway_m, population.cell_m),
+            kernels.View(
+                NEAR_M,
+                NEAR_FULL_M,
+                reach_m,
+                fade_per_m,
+                np.ascontiguousarray(turned.T),
+                tangents,
+                pad_m,
+            ),
+            kernels.Motion(
+                (relative @ rotation).astype(np.float32),
+                sway_m,
+                np.mod(population.sway_rad_per_s * time_s / (2 * np.pi), 1.0),
+                self.axes_world[:2] @ turned,
+                (sway_m_per_s[:, :, None] * (self.axes_world[:2] @ rotation)).astype(np.float32),
+            ),
+            kernels.Looks(
+                population.diameters_m.astype(np.float32),
+                shapes_in(turned) if population.tumbles else _NO_SHAPES,
+                shape_turns(time_s) if population.tumbles else _NO_TURNS,
+                _SINE,
+            ),
         )
         capacity = int(1.5 * resolved.expected_count) + 256
         while True:

@@ -7,12 +7,64 @@ changed constant of another module.
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from weather_aug._compiled import compiled, inlined
 
 QUARTER_PI = 0.7853981633974483
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+BUFFER = 1024
+"""Candidates that are looked at closely in one go."""
+
+
+class View(NamedTuple):
+    """What a camera sees and resolves of C classes of Q sizes; field axes are the particles'."""
+
+    near_m: Any
+    """Near limit."""
+    near_full_m: Any
+    """Depth up to which the opacity rises from 0 at the near limit."""
+    reach_m: Any
+    """(C, Q) float32 depth limits, rising along each row; Q is a power of 2 up to 16."""
+    fade_per_m: Any
+    """(C, Q) float32, how fast the opacity falls before the reach."""
+    camera_from_field: Any
+    """(3, 3) rotation."""
+    tangents: Any
+    """(4,): left, right, top, bottom of the view, blur included."""
+    pad_m: Any
+    """(C,) how far outside the view a particle of the class still touches it."""
+
+
+class Motion(NamedTuple):
+    """How the particles of each class move, camera axes."""
+
+    velocities: Any
+    """(C, 3) float32, relative to the camera."""
+    sway_m: Any
+    """(C, 2) amplitudes of the two sways, not negative."""
+    sway_turns: Any
+    """(C, 2) turns of the sways at this time."""
+    sway_axes: Any
+    """(2, 3) directions of the sways."""
+    sway_velocities: Any
+    """(C, 2, 3) float32 velocity amplitude of both sways."""
+
+
+class Looks(NamedTuple):
+    """What a particle looks like."""
+
+    diameters_m: Any
+    """(C, Q) float32."""
+    shapes: Any
+    """(S, 5, 6) float32, covariances of tumbling particles of diameter 1 (see tumble.py), camera
+    axes, S a power of 2 up to 1024; S = 0 for balls."""
+    shape_turns: Any
+    """(S,) turns of the tumbling at this time."""
+    sine: Any
+    """(1024,) one turn of the sine."""
 
 
 @compiled
@@ -156,31 +208,7 @@ def _turn(word, turns):
 
 
 @compiled
-def scatter(
-    class_keys,
-    counts,
-    cell_m,
-    origin_m,
-    reach_m,
-    fade_per_m,
-    near_m,
-    near_full_m,
-    planes,
-    bounds,
-    camera_from_world,
-    view,
-    pad_m,
-    sine,
-    sway_m,
-    sway_turns,
-    sway_axes,
-    diameters_m,
-    velocities,
-    sway_velocities,
-    shapes,
-    shape_turns,
-    out,
-):
+def scatter(class_keys, counts, cell_m, origin_m, planes, bounds, view, motion, looks, out):
     """Enumerate the particles that a camera can resolve, in camera axes.
 
     The particles of a class form an endless Poisson field that drifts rigidly: space, seen from the
@@ -194,48 +222,37 @@ def scatter(
         counts: (C, K) uint64, the distribution function of the count of a cube times 2^64; the
             last is the largest word.
         cell_m: (C,) side of a cube.
-        origin_m: (C, 3) camera position minus the drift of the class, world axes, float64.
-        reach_m: (C, Q) float32 depth limits, rising along each row; Q is a power of 2 up to 16.
-        fade_per_m: (C, Q) float32, how fast the opacity falls before the reach.
-        near_m: Near limit.
-        near_full_m: Depth up to which the opacity rises from 0 at the near limit.
-        planes: (C, 6, 4) planes of the padded view, world axes about the camera: normals point
+        origin_m: (C, 3) camera position minus the drift of the class, field axes, float64.
+        planes: (C, 6, 4) planes of the padded view, field axes about the camera: normals point
             inwards, the offset holds the padding and half a cube.
-        bounds: (C, 2, 3) box around the padded view, world axes about the camera, metres.
-        camera_from_world: (3, 3) rotation.
-        view: (x0, x1, y0, y1) tangents of the view, blur included.
-        pad_m: (C,) how far outside the view a particle of the class still touches it.
-        sine: (1024,) one turn of the sine.
-        sway_m: (C, 2) amplitudes of the two sways.
-        sway_turns: (C, 2) turns of the sways at this time.
-        sway_axes: (2, 3) directions of the sways, camera axes.
-        diameters_m: (C, Q) float32.
-        velocities: (C, 3) float32, camera axes, relative to the camera.
-        sway_velocities: (C, 2, 3) float32 velocity amplitude of both sways, camera axes.
-        shapes: (S, 5, 6) float32, covariances of tumbling particles of diameter 1 (see tumble.py),
-            camera axes, S a power of 2 up to 1024; S = 0 for balls.
-        shape_turns: (S,) turns of the tumbling at this time.
+        bounds: (C, 2, 3) box around the padded view, field axes about the camera, metres.
+        view: View.
+        motion: Motion.
+        looks: Looks.
         out: (N, 13) float32: position, velocity, covariance, opacity; camera axes.
 
     Returns:
         Number of particles found; those beyond N are counted, not written.
     """
     found = 0
-    capacity = out.shape[0]
-    sizes = reach_m.shape[1]
+    sizes = view.reach_m.shape[1]
     size_mask = np.uint64(sizes - 1)
-    shape_mask = np.uint64(max(shapes.shape[0] - 1, 0))
     grid = np.uint64(0xFFFFF)
-    r = camera_from_world
-    per_near_m = 1.0 / (near_full_m - near_m)
+    r = view.camera_from_field
+    left, right, top, bottom = view.tangents
+    steepest = max(abs(left), abs(right), abs(top), abs(bottom))
+    words = np.empty(BUFFER + counts.shape[1], np.uint64)
+    places = np.empty((BUFFER + counts.shape[1], 3))
+    limit = np.empty(sizes)
     for c in range(class_keys.shape[0]):
-        if reach_m[c, sizes - 1] <= near_m:
+        if view.reach_m[c, sizes - 1] <= view.near_m:
             continue
         cell = cell_m[c]
-        empty = counts[c, 0]
-        pad = pad_m[c]
-        most_sway = abs(sway_m[c, 0]) + abs(sway_m[c, 1])
-        wide = pad + most_sway * (1.0 + max(abs(view[0]), abs(view[1]), abs(view[2]), abs(view[3])))
+        swing = motion.sway_m[c, 0] + motion.sway_m[c, 1]
+        wide = view.pad_m[c] + swing * (1.0 + steepest)
+        near = view.near_m - swing
+        for q in range(sizes):
+            limit[q] = view.reach_m[c, q] + swing
         # Where the camera sits in the class's lattice: an integer cube and the rest.
         origin = origin_m[c] / cell
         base = np.floor(origin)
@@ -250,6 +267,7 @@ def scatter(
         xx, xy, xz = r[0, 0] * step, r[0, 1] * step, r[0, 2] * step
         yx, yy, yz = r[1, 0] * step, r[1, 1] * step, r[1, 2] * step
         zx, zy, zz = r[2, 0] * step, r[2, 1] * step, r[2, 2] * step
+        fill = 0
         for ix in range(x0, x1 + 1):
             px = (ix - rx) * cell
             for iy in range(y0, y1 + 1):
@@ -259,9 +277,7 @@ def scatter(
                 z1 = int(np.floor(high / cell + rz - 0.5 + 1e-6))
                 for iz in range(z0, z1 + 1):
                     key = cell_key(class_keys[c], bx + ix, by + iy, bz + iz)
-                    if key <= empty:
-                        continue
-                    many = 1
+                    many = 0
                     while key > counts[c, many]:
                         many += 1
                     pz = (iz - rz) * cell
@@ -272,55 +288,74 @@ def scatter(
                     for _ in range(many):
                         slot += GOLDEN
                         word = mix64(slot)
-                        q = np.int64(word & size_mask)
                         ux = np.float64(np.int64((word >> np.uint64(4)) & grid))
                         uy = np.float64(np.int64((word >> np.uint64(24)) & grid))
                         uz = np.float64(np.int64(word >> np.uint64(44)))
-                        z = corner_z + zx * ux + zy * uy + zz * uz
-                        if z < near_m - most_sway or z > reach_m[c, q] + most_sway:
-                            continue
                         x = corner_x + xx * ux + xy * uy + xz * uz
-                        if x < view[0] * z - wide or x > view[1] * z + wide:
-                            continue
                         y = corner_y + yx * ux + yy * uy + yz * uz
-                        if y < view[2] * z - wide or y > view[3] * z + wide:
-                            continue
-                        # Phases and shape come from another hash, for the few that are in view.
-                        word = mix64(word)
-                        ta = _turn(word, sway_turns[c, 0])
-                        tb = _turn(word >> np.uint64(10), sway_turns[c, 1])
-                        sa, sb = sway_m[c, 0] * sine[ta], sway_m[c, 1] * sine[tb]
-                        x += sa * sway_axes[0, 0] + sb * sway_axes[1, 0]
-                        y += sa * sway_axes[0, 1] + sb * sway_axes[1, 1]
-                        z += sa * sway_axes[0, 2] + sb * sway_axes[1, 2]
-                        if z < near_m or z > reach_m[c, q]:
-                            continue
-                        if x < view[0] * z - pad or x > view[1] * z + pad:
-                            continue
-                        if y < view[2] * z - pad or y > view[3] * z + pad:
-                            continue
-                        if found < capacity:
-                            row = out[found]
-                            row[0], row[1], row[2] = x, y, z
-                            ca = np.float32(sine[(ta + 256) & 1023])
-                            cb = np.float32(sine[(tb + 256) & 1023])
-                            for k in range(3):
-                                row[3 + k] = (
-                                    velocities[c, k]
-                                    + ca * sway_velocities[c, 0, k]
-                                    + cb * sway_velocities[c, 1, k]
-                                )
-                            square = diameters_m[c, q] * diameters_m[c, q]
-                            if shapes.shape[0] > 0:
-                                s = np.int64((word >> np.uint64(20)) & shape_mask)
-                                t = _turn(word >> np.uint64(30), shape_turns[s])
-                                _tumbled(shapes[s], square, sine, t, row)
-                            else:
-                                _ball(square, row)
-                            leaving = (reach_m[c, q] - z) * fade_per_m[c, q]
-                            entering = (z - near_m) * per_near_m
-                            row[12] = min(leaving, entering, 1.0)
-                        found += 1
+                        z = corner_z + zx * ux + zy * uy + zz * uz
+                        # One in three passes, unpredictably: count it, do not branch on it.
+                        passes = (z >= near) & (z <= limit[np.int64(word & size_mask)])
+                        passes &= (x >= left * z - wide) & (x <= right * z + wide)
+                        passes &= (y >= top * z - wide) & (y <= bottom * z + wide)
+                        words[fill] = word
+                        places[fill, 0], places[fill, 1], places[fill, 2] = x, y, z
+                        fill += np.int64(passes)
+                    if fill >= BUFFER:
+                        found = _record(c, words, places, fill, view, motion, looks, found, out)
+                        fill = 0
+        found = _record(c, words, places, fill, view, motion, looks, found, out)
+    return found
+
+
+@compiled
+def _record(c, words, places, fill, view, motion, looks, found, out):
+    """Let the candidates of a class sway, and write those that the camera resolves."""
+    capacity = out.shape[0]
+    sine = looks.sine
+    size_mask = np.uint64(view.reach_m.shape[1] - 1)
+    shape_mask = np.uint64(max(looks.shapes.shape[0] - 1, 0))
+    left, right, top, bottom = view.tangents
+    per_near_m = 1.0 / (view.near_full_m - view.near_m)
+    pad = view.pad_m[c]
+    axes = motion.sway_axes
+    for i in range(fill):
+        q = np.int64(words[i] & size_mask)
+        # Phases and shape come from another hash, for the few that are in view.
+        word = mix64(words[i])
+        ta = _turn(word, motion.sway_turns[c, 0])
+        tb = _turn(word >> np.uint64(10), motion.sway_turns[c, 1])
+        sa, sb = motion.sway_m[c, 0] * sine[ta], motion.sway_m[c, 1] * sine[tb]
+        x = places[i, 0] + sa * axes[0, 0] + sb * axes[1, 0]
+        y = places[i, 1] + sa * axes[0, 1] + sb * axes[1, 1]
+        z = places[i, 2] + sa * axes[0, 2] + sb * axes[1, 2]
+        passes = (z >= view.near_m) & (z <= view.reach_m[c, q])
+        passes &= (x >= left * z - pad) & (x <= right * z + pad)
+        passes &= (y >= top * z - pad) & (y <= bottom * z + pad)
+        if not passes:
+            continue
+        if found < capacity:
+            row = out[found]
+            row[0], row[1], row[2] = x, y, z
+            ca = np.float32(sine[(ta + 256) & 1023])
+            cb = np.float32(sine[(tb + 256) & 1023])
+            for k in range(3):
+                row[3 + k] = (
+                    motion.velocities[c, k]
+                    + ca * motion.sway_velocities[c, 0, k]
+                    + cb * motion.sway_velocities[c, 1, k]
+                )
+            square = looks.diameters_m[c, q] * looks.diameters_m[c, q]
+            if looks.shapes.shape[0] > 0:
+                s = np.int64((word >> np.uint64(20)) & shape_mask)
+                t = _turn(word >> np.uint64(30), looks.shape_turns[s])
+                _tumbled(looks.shapes[s], square, sine, t, row)
+            else:
+                _ball(square, row)
+            leaving = (view.reach_m[c, q] - z) * view.fade_per_m[c, q]
+            entering = (z - view.near_m) * per_near_m
+            row[12] = min(leaving, entering, 1.0)
+        found += 1
     return found
 
 

@@ -115,9 +115,11 @@ def test_seed_and_kind_choose_the_field():
     assert not {tuple(r) for r in first[:, :3]} & {tuple(r) for r in other[:, :3]}
 
 
-def test_a_window_draws_a_subset_in_the_same_order():
-    this, cam = field(statistics.snow(2.0)), camera(speed=10.0)
-    resolved = this.resolve(cam, 20_000)
+@pytest.mark.parametrize("population", [statistics.snow(2.0), statistics.rain(20.0)])
+def test_a_window_draws_a_subset_in_the_same_order(population):
+    cam = camera(speed=10.0)
+    this = field(population, wind=(2.0, 5.0, 0.0))
+    resolved = this.resolve(cam, 5_000)
     everything = [tuple(r) for r in this.particles(cam, 1.0, resolved, whole(cam))]
     part = [tuple(r) for r in this.particles(cam, 1.0, resolved, (30, 50, 24, 40))]
     assert 0 < len(part) < len(everything)

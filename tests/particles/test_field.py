@@ -312,3 +312,25 @@ def test_bad_arguments_are_named():
     for bad in (np.eye(3), np.diag([1.0, 1, -1, 1]), np.diag([2.0, 1, 1, 1]), np.eye(4) * np.nan):
         with pytest.raises(ArgumentError, match="field_from_world must be"):
             ParticleField(population, 0, air, AXES, bad)
+
+
+@pytest.mark.parametrize(
+    ("population", "wind"),
+    [
+        (statistics.rain(300.0), (40.0, -40.0, 5.0)),
+        (statistics.snow(50.0, wetness=1.0), (-30.0, 30.0, 0.0)),
+        (statistics.rain(2e-4), (0.0, 0.0, 0.0)),
+    ],
+)
+def test_records_stay_finite_in_any_weather(population, wind):
+    cam = camera(speed=60.0, exposure_s=0.02)
+    this = field(population, wind=wind, time_s=1e5)
+    resolved = this.resolve(cam, 5_000)
+    found = this.particles(cam, 1e5, resolved, whole(cam))
+    assert np.isfinite(found).all()
+    assert ((found[:, 12] >= 0) & (found[:, 12] <= 1)).all()
+    assert (found[:, 2] >= NEAR_M).all()
+    assert (
+        np.isfinite(resolved.optical_depth).all()
+        and (np.diff(resolved.optical_depth) > -1e-7).all()
+    )

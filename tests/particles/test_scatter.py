@@ -34,7 +34,7 @@ def reference(population, seed, cam, time_s, reach_m):
     half = int(np.ceil(2 * reach_m / cell)) + 1
     found = []
     for ix, iy, iz in np.ndindex(*[2 * half + 1] * 3):
-        index = [int(v) for v in middle + (ix - half, iy - half, iz - half)]
+        index = [int(v) for v in middle + np.array([ix, iy, iz]) - half]
         key = (class_key + index[0] * 0xD6E8FEB86659FD93) & WORD
         key = mixed(key) + index[1] * 0xA0761D6478BD642F & WORD
         key = mixed(mixed(key) + index[2] * 0xE7037ED1A0B428DB & WORD)

@@ -1,11 +1,15 @@
 """The 4D Gaussian field: which particles are where at time t, seen from a camera.
 
 Convention:
-    The field of a class of particles is endless, at rest in a frame that drifts with the class's
-    velocity (wind plus fall), and a pure function of (seed, kind, class, place). Nothing is
-    stepped and nothing is recycled: any time and any camera can be asked for alone, two cameras
-    see the same particles, and where a class is denser at a higher rate (all of rain) particles are
-    added to those already there. Positions are in world metres; time is in seconds.
+    The field of a class of particles is endless, at rest in a frame that the air has carried (its
+    drift) and that has fallen with the class's speed, and a pure function of (seed, kind, class,
+    place). Around its place in that frame each particle sways, by a bounded function of time whose
+    derivative is part of its velocity. Nothing is stepped and nothing is recycled: any time and any
+    camera can be asked for alone, two cameras see the same particles, and where a class is denser
+    at a higher rate (all of rain) particles are added to those already there.
+
+    Positions are in world metres; time is in seconds. Axes of the field are those of the world,
+    unless a reference camera carries the field along (`field_from_world`).
 """
 
 from __future__ import annotations

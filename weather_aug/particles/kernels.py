@@ -300,7 +300,7 @@ def scatter(class_keys, counts, cell_m, origin_m, planes, bounds, view, motion, 
                         passes &= (y >= top * z - wide) & (y <= bottom * z + wide)
                         words[fill] = word
                         places[fill, 0], places[fill, 1], places[fill, 2] = x, y, z
-                        fill += np.int64(passes)
+                        fill += int(passes)
                     if fill >= BUFFER:
                         found = _record(c, words, places, fill, view, motion, looks, found, out)
                         fill = 0

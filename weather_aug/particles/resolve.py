@@ -2,11 +2,14 @@
 
 A particle is drawn where its pixel opacity is at least `alpha_min`; the rest of the population is a
 veil in closed form, so that the optical depth of both together is right at any particle budget.
+Drawn particles fade in behind the near limit and out before their reach, so that none pops up; the
+veil accounts for that too.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +20,12 @@ from weather_aug.particles.statistics import Population
 
 NEAR_M = 0.5
 """Nearer particles are drops on the lens or behind the bonnet, not in the air."""
+NEAR_FULL_M = 0.7
+"""The opacity of particles rises from 0 at the near limit to its full value here."""
+FADE_SHARE = 0.15
+"""Share of its reach, at the end, over which the opacity of a particle falls to 0."""
+LEAST_REACH_M = NEAR_FULL_M / (1.0 - FADE_SHARE)
+"""A size with a shorter reach is not drawn, so that the two fades never overlap."""
 FAR_M = 60.0
 """No particle is drawn beyond."""
 FAINTEST_ALPHA = 0.01
@@ -27,7 +36,7 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Resolved:
     """The resolved part of a population for one camera, and the optical depth it carries."""
 
@@ -35,20 +44,23 @@ class Resolved:
     reach_m: Float32
     """(C, Q) depth up to which a particle of this class and size is drawn; 0 for never."""
     expected_count: float
-    """Particles drawn in the whole picture, on average."""
+    """Particles drawn in the whole picture, on average, those that fade included."""
     optical_depth: Float32
     """(DEPTH_BINS + 1,) of drawn particles, on the axis, up to the depth k / DEPTH_BINS * FAR_M."""
 
 
 def resolve(
-    population: Population, camera: Camera, streak_m: Float64, max_particles: int
+    population: Population, camera: Camera, relative_m_per_s: Float64, max_particles: int
 ) -> Resolved:
     """Split `population` into drawn particles and veil for one camera.
+
+    Remembered by the numbers that matter, because a loader asks for the same camera and weather
+    again and again; the arrays are read-only.
 
     Args:
         population: What is in the air.
         camera: The whole picture's camera; a crop draws a subset of its particles.
-        streak_m: (C,) path of a particle relative to the camera while the shutter is open.
+        relative_m_per_s: (C, 3) velocity of each class relative to the camera, camera axes.
         max_particles: Expected number of drawn particles at the most.
 
     Returns:
@@ -57,22 +69,64 @@ def resolve(
     Source:
         pixel opacity of a drop of width w and streak l pixels: (pi/4) w^2 / (max(w,1) max(l+w,1)).
     """
-    fx, fy = camera.focal_px
-    focal_px = float(np.sqrt(fx * fy))
-    solid_px = camera.width * camera.height / (fx * fy)
-    per_size = population.density_per_m3 / population.diameters_m.shape[1]
+    picture = (*camera.focal_px, *camera.principal_px, camera.width, camera.height)
+    return _resolved(
+        np.shape(population.diameters_m),
+        population.diameters_m.tobytes(),
+        population.density_per_m3.tobytes(),
+        np.ascontiguousarray(relative_m_per_s, np.float64).tobytes(),
+        picture,
+        camera.exposure_s,
+        max_particles,
+    )
+
+
+@lru_cache(maxsize=256)
+def _resolved(
+    shape: tuple[int, ...],
+    diameters: bytes,
+    density: bytes,
+    relative: bytes,
+    picture: tuple[float, ...],
+    exposure_s: float,
+    max_particles: int,
+) -> Resolved:
+    """`resolve` of plain numbers: the arrays come as bytes, to be compared and hashed."""
+    diameters_m = np.frombuffer(diameters).reshape(shape).copy()
+    per_size = np.frombuffer(density) / shape[1]
+    across = _across_picture(picture, np.frombuffer(relative).reshape(-1, 3))
+    fx, fy, _, _, width, height = picture
     alpha_min, reach_m, count = kernels.solve_reach(
-        population.diameters_m,
+        diameters_m,
         per_size,
-        streak_m,
-        focal_px,
-        solid_px,
+        across * exposure_s,
+        float(np.sqrt(fx * fy)),
+        width * height / (fx * fy),
         float(max_particles),
         FAINTEST_ALPHA,
         NEAR_M,
+        LEAST_REACH_M,
         FAR_M,
     )
     optical_depth = kernels.resolved_optical_depth(
-        population.diameters_m, per_size, reach_m, NEAR_M, FAR_M, DEPTH_BINS
+        diameters_m, per_size, reach_m, NEAR_M, NEAR_FULL_M, FADE_SHARE, FAR_M, DEPTH_BINS
     )
-    return Resolved(alpha_min, reach_m.astype(np.float32), count, optical_depth)
+    reach_m = reach_m.astype(np.float32)
+    for array in (reach_m, optical_depth):
+        array.flags.writeable = False
+    return Resolved(alpha_min, reach_m, count, optical_depth)
+
+
+def _across_picture(picture: tuple[float, ...], relative: Float64) -> Float64:
+    """Speed (C,) across the line of sight, m/s, averaged over the picture.
+
+    `relative` is (C, 3), in camera axes. Motion along the line of sight draws no streak: from a
+    moving car the speed across is much less than the speed. The camera's own turning is left out,
+    because its share grows with depth.
+    """
+    fx, fy, cx, cy, width, height = picture
+    tx = (np.linspace(0, width, 7) - cx) / fx
+    ty = (np.linspace(0, height, 7) - cy) / fy
+    across_x = relative[:, 0, None, None] - tx[:, None] * relative[:, 2, None, None]
+    across_y = relative[:, 1, None, None] - ty[None, :] * relative[:, 2, None, None]
+    return np.asarray(np.hypot(across_x, across_y).mean(axis=(1, 2)))

@@ -1,0 +1,219 @@
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from particle_scene import camera, field, inside, seen
+
+from weather_aug.particles import resolve as resolving
+from weather_aug.particles import statistics
+from weather_aug.particles.resolve import FAR_M, NEAR_FULL_M, NEAR_M
+
+
+def test_budget_is_kept_and_used():
+    cam = camera(width=1024, height=512)
+    for budget in (5_000, 50_000):
+        resolved = field(statistics.snow(4.0)).resolve(cam, budget)
+        assert 0.95 * budget < resolved.expected_count <= budget
+
+
+@pytest.mark.parametrize(("rate", "reference"), [(2.5, 17_000), (10.0, 68_000), (50.0, 308_000)])
+def test_drops_that_a_driving_camera_resolves(rate, reference):
+    """KITTI's camera at 10 m/s, counted before by integrating over the mean image streak."""
+    cam = camera(speed=10.0, width=1242, height=375, exposure_s=0.002)
+    focal = np.diag([721.0, 721.0, 1.0]) + np.array([[0, 0, 621], [0, 0, 187], [0, 0, 0.0]])
+    cam = replace(cam, intrinsics=focal)
+    resolved = field(statistics.rain(rate)).resolve(cam, 500_000)
+    assert resolved.alpha_min == 0.01
+    assert 0.5 * reference < resolved.expected_count < 1.6 * reference
+
+
+def test_motion_along_the_view_hides_no_drops():
+    """Twice the speed towards drops must not cost most of them, as twice the streak would."""
+    still, fast = (
+        field(statistics.rain(20.0)).resolve(camera(speed=v, exposure_s=0.005), 500_000)
+        for v in (0.0, 15.0)
+    )
+    assert fast.expected_count > 0.2 * still.expected_count
+
+
+def at(resolved, depth_m):
+    """Optical depth of drawn particles up to a depth, between the table's entries."""
+    depths = np.linspace(0, FAR_M, len(resolved.optical_depth))
+    return np.interp(depth_m, depths, resolved.optical_depth)
+
+
+def opacity(depth_m, reach_m):
+    """Of a particle that fades in and out: written down once more, as a reference."""
+    rise = np.clip((depth_m - NEAR_M) / (NEAR_FULL_M - NEAR_M), 0, 1)
+    return rise * np.clip((reach_m - depth_m) / (0.15 * reach_m), 0, 1)
+
+
+def streaks(population, cam):
+    """(C,) path across the line of sight while the shutter is open, averaged over the picture."""
+    velocity = -population.fall_speed_m_per_s[:, None] * (1 + population.wetness) * [0, 0, 1.0]
+    relative = (velocity - cam.velocity_m_per_s) @ cam.world_from_camera[:3, :3]
+    (fx, fy), (cx, cy) = cam.focal_px, cam.principal_px
+    lengths = []
+    for u in np.linspace(0, cam.width, 7):
+        for v in np.linspace(0, cam.height, 7):
+            across = relative[:, :2] - relative[:, 2:] * [(u - cx) / fx, (v - cy) / fy]
+            lengths.append(np.hypot(*across.T))
+    return np.mean(lengths, axis=0) * cam.exposure_s
+
+
+def reach(diameter_m, streak_m, focal_px, alpha):
+    """Depth where (pi/4) w^2 / (max(w, 1) max(l + w, 1)) falls to alpha, by search."""
+    depth = np.geomspace(0.01, 400, 40_000)
+    w, length = focal_px * diameter_m / depth, focal_px * streak_m / depth
+    pixel = np.pi / 4 * w * w / (np.maximum(w, 1) * np.maximum(length + w, 1))
+    above = depth[pixel >= alpha]
+    return above[-1] if len(above) else 0.0
+
+
+def drawn_optical_depth(population, sizes, cam, alpha, depth_m, fade=opacity):
+    """Quadrature over size and depth of what is drawn; `sizes` are (weight, D) of each class."""
+    depth = np.linspace(NEAR_M, depth_m, 1500)
+    total = 0.0
+    for k, streak_m in enumerate(streaks(population, cam)):
+        for weight, diameter_m in zip(*sizes[k], strict=True):
+            limit = min(reach(diameter_m, streak_m, cam.focal_px[0], alpha), FAR_M)
+            if limit > NEAR_FULL_M / 0.85:
+                area = weight * np.pi / 4 * diameter_m**2
+                total += area * np.trapezoid(fade(depth, limit), depth)
+    return total
+
+
+def quadrature_sizes(kind, rate):
+    """The size law itself, not the sixteen sizes of a class: Gauss-Legendre nodes in each class."""
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    edges = statistics.RAIN_EDGES_MM if kind == "rain" else statistics.SNOW_EDGES_MM
+    sizes = []
+    for low, high in pairwise(edges):
+        d = 0.5 * (low + high) + 0.5 * (high - low) * nodes
+        if kind == "rain":
+            law, diameter_mm = 8000 * np.exp(-4.1 * rate**-0.21 * d), d
+        else:
+            law = 3800 * rate**-0.87 * np.exp(-2.55 * rate**-0.48 * d)
+            diameter_mm = np.sqrt(d**3 / 0.17)
+        sizes.append((0.5 * (high - low) * weights * law, diameter_mm * 1e-3))
+    return sizes
+
+
+@pytest.mark.parametrize("budget", [10_000, 50_000, 200_000])
+@pytest.mark.parametrize("kind", ["rain", "snow"])
+def test_drawn_and_veil_are_the_whole(kind, budget):
+    """The veil is the total less the table: the table must equal what is drawn, by quadrature.
+
+    To 1 % of the total optical depth at 5, 20 and 60 m, over the smooth size law.
+    """
+    rate = 4.0
+    population = getattr(statistics, kind)(rate)
+    cam = camera(speed=5.0, width=1024, height=512, exposure_s=0.002)
+    resolved = field(population).resolve(cam, budget)
+    sizes = quadrature_sizes(kind, rate)
+    for depth_m in (5.0, 20.0, 60.0):
+        expected = drawn_optical_depth(population, sizes, cam, resolved.alpha_min, depth_m)
+        total = population.extinction_per_m * depth_m
+        assert expected > 0.005 * total
+        assert abs(at(resolved, depth_m) - expected) < 0.01 * total
+        # Both together: nothing is lost where particles fade, and nothing counts twice.
+        assert 0 <= at(resolved, depth_m) < total
+
+
+def test_the_table_is_exact_for_its_own_sizes():
+    population = statistics.rain(20.0)
+    cam = camera(speed=5.0, width=1024, height=512)
+    resolved = field(population).resolve(cam, 50_000)
+    per_size = population.density_per_m3 / 16
+    depths = np.linspace(0, FAR_M, len(resolved.optical_depth))
+    fine = np.linspace(0, FAR_M, 120_001)
+    for k in (3, 9, 13):
+        alone = replace(population, density_per_m3=np.where(np.arange(14) == k, per_size * 16, 0))
+        table = resolving.kernels.resolved_optical_depth(
+            alone.diameters_m,
+            alone.density_per_m3 / 16,
+            resolved.reach_m.astype(float),
+            NEAR_M,
+            NEAR_FULL_M,
+            0.15,
+            FAR_M,
+            len(depths) - 1,
+        )
+        rate = np.zeros_like(fine)
+        for d, limit in zip(population.diameters_m[k], resolved.reach_m[k], strict=True):
+            if limit > 0:
+                rate += per_size[k] * np.pi / 4 * d**2 * opacity(fine, float(limit))
+        steps = 0.5 * (rate[1:] + rate[:-1]) * (fine[1] - fine[0])
+        expected = np.interp(depths, fine, np.concatenate([[0], np.cumsum(steps)]))
+        np.testing.assert_allclose(table, expected, atol=2e-5 * expected[-1])
+
+
+def test_forgetting_the_fade_breaks_the_balance():
+    """Planted fault: particles that fade, under a veil that takes them for whole."""
+    population = statistics.snow(4.0)
+    cam = camera(speed=5.0, width=1024, height=512, exposure_s=0.002)
+    resolved = field(population).resolve(cam, 50_000)
+    sizes = quadrature_sizes("snow", 4.0)
+
+    def abrupt(depth_m, reach_m):
+        return ((depth_m > NEAR_M) & (depth_m < reach_m)).astype(float)
+
+    errors = [
+        abs(
+            at(resolved, depth_m)
+            - drawn_optical_depth(population, sizes, cam, resolved.alpha_min, depth_m, abrupt)
+        )
+        / (population.extinction_per_m * depth_m)
+        for depth_m in (5.0, 20.0, 60.0)
+    ]
+    assert max(errors) > 0.02
+
+
+@pytest.mark.parametrize(
+    "population", [statistics.rain(20.0), statistics.snow(4.0), statistics.snow(4.0, wetness=0.6)]
+)
+def test_drawn_particles_carry_the_optical_depth_of_the_table(population):
+    """Monte Carlo: sum of opacity times silhouette over the area of the view at its depth."""
+    cam = camera(width=320, height=192)
+    resolved = field(population).resolve(cam, 20_000)
+    near_m, far_m = 2.0, 20.0
+    (fx, fy) = cam.focal_px
+    solid = cam.width * cam.height / (fx * fy)
+    sums = []
+    for seed in range(12):
+        found = seen(population, cam, 1.0, resolved, seed=seed).astype(float)
+        found = found[inside(found, cam)]
+        found = found[(found[:, 2] > near_m) & (found[:, 2] < far_m)]
+        tx, ty = found[:, 0] / found[:, 2], found[:, 1] / found[:, 2]
+        # Shadow on the plane of equal depth: the covariance projected along the line of sight.
+        xx, xy, xz, yy, yz, zz = found[:, 6:12].T
+        a, c = xx - 2 * tx * xz + tx**2 * zz, yy - 2 * ty * yz + ty**2 * zz
+        b = xy - tx * yz - ty * xz + tx * ty * zz
+        shadow = 2 * np.pi * np.sqrt(a * c - b * b) / np.sqrt(1 + tx**2 + ty**2)
+        sums.append((found[:, 12] * shadow / (solid * found[:, 2] ** 2)).sum())
+    expected = at(resolved, far_m) - at(resolved, near_m)
+    error = np.std(sums, ddof=1) / np.sqrt(len(sums))
+    assert error < 0.02 * expected
+    assert abs(np.mean(sums) - expected) < 4 * error
+
+
+def test_the_same_camera_and_weather_are_solved_once():
+    """And another number that matters is another solution."""
+    resolving._resolved.cache_clear()
+    cam, population = camera(speed=5.0), statistics.rain(7.0)
+    first = field(population).resolve(cam, 5_000)
+    moved = camera(speed=5.0, centre=(30.0, 2.0, 1.5))
+    assert field(statistics.rain(7.0), seed=9).resolve(moved, 5_000) is first
+    with pytest.raises(ValueError, match="read-only"):
+        first.reach_m[0, 0] = 1.0
+    others = [
+        field(statistics.rain(7.1)).resolve(cam, 5_000),
+        field(population).resolve(camera(speed=5.1), 5_000),
+        field(population).resolve(cam, 5_001),
+        field(population).resolve(replace(cam, exposure_s=0.004), 5_000),
+        field(population).resolve(cam.resized(320, 192), 5_000),
+        field(population, wind=(0.0, 1.0, 0.0)).resolve(cam, 5_000),
+    ]
+    assert len({id(r) for r in (first, *others)}) == 7
+    assert resolving._resolved.cache_info().misses == 7

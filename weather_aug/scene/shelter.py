@@ -9,7 +9,8 @@ tunnel's ceiling, a canopy. The heights of all surface points in a column of the
 
 A cover that is missed costs little; one that is not there makes a hole in the rain. So each column
 needs the ground, the gap and a thin layer, and covers need to be wide. Leaves let rain through:
-where labels exist, only what may be part of a building or a bridge is a cover.
+where labels exist, only what may be part of a building or a bridge is a cover; without labels
+only what is as large and flat as a deck, because a crown is neither.
 """
 
 from __future__ import annotations
@@ -45,6 +46,9 @@ LAYERS_BELOW, LAYERS_ABOVE = 40, 16
 LEAST_POINTS, LEAST_POINTS_BELOW, LEAST_FRAMES = 6, 3, 2
 STRAY_SHARE = 0.1
 LEAST_AREA_M2 = 8.0
+LEAST_UNLABELLED_AREA_M2 = 40.0
+MOST_UNEVEN_M = 0.2
+"""Median distance of an unlabelled cover's cells from a plane."""
 LEAST_WIDTH_CELLS = 5
 MAX_CELLS = 64_000_000
 
@@ -100,10 +104,12 @@ def shelter_of(views: Iterable[View], axes_world: Float64) -> Shelter | None:
         SceneError: If the covers lie too far apart for one map.
     """
     reference_m: Float64 | None = None
+    labelled = True
     tables: list[_Table] = []
     for view in views:
         if reference_m is None:
             reference_m = axes_world @ view.camera.centre_world
+        labelled &= view.label is not None
         tables.append(_counted(view, axes_world, reference_m))
         # Merged now and then, so that memory follows the street and not the number of frames.
         if len(tables) == 64:
@@ -113,7 +119,7 @@ def shelter_of(views: Iterable[View], axes_world: Float64) -> Shelter | None:
     cells, cover_m = _covered(_merged(tables))
     if len(cells) == 0:
         return None
-    return _mapped(cells, cover_m, reference_m, axes_world)
+    return _mapped(cells, cover_m, reference_m, axes_world, labelled)
 
 
 def _counted(view: View, axes_world: Float64, reference_m: Float64) -> _Table:
@@ -224,7 +230,7 @@ def _columns(table: _Table, cells: Int64, lowest: Int64) -> tuple[Int64, Int64, 
 
 
 def _mapped(
-    cells: Int64, cover_m: Float64, reference_m: Float64, axes_world: Float64
+    cells: Int64, cover_m: Float64, reference_m: Float64, axes_world: Float64, labelled: bool
 ) -> Shelter | None:
     """The wide patches of covered cells, cut to their bounds."""
     index = np.stack([cells // _ROW, cells % _ROW], axis=1)
@@ -234,7 +240,7 @@ def _mapped(
     found[place] = 1
     heights = np.zeros(shape, np.float32)
     heights[place] = cover_m
-    wide = _wide_patches(found)
+    wide = _wide_patches(found, heights, labelled)
     if not wide.any():
         return None
     nearest = _nearest_values(heights, found & wide)
@@ -257,8 +263,11 @@ def _bounds(index: Int64) -> tuple[Int64, tuple[int, int]]:
     return least, (rows, columns)
 
 
-def _wide_patches(found: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _wide_patches(
+    found: NDArray[np.uint8], heights: NDArray[np.float32], labelled: bool
+) -> NDArray[np.uint8]:
     """Patches without their small holes, if they are wide, large and mostly found."""
+    least_area_m2 = LEAST_AREA_M2 if labelled else LEAST_UNLABELLED_AREA_M2
     margin = LEAST_WIDTH_CELLS
     square = np.ones((LEAST_WIDTH_CELLS, LEAST_WIDTH_CELLS), np.uint8)
     padded = np.pad(found, margin)
@@ -267,10 +276,33 @@ def _wide_patches(found: NDArray[np.uint8]) -> NDArray[np.uint8]:
     count, patches = cv2.connectedComponents(opened, connectivity=4)
     area = np.bincount(patches.reshape(-1), minlength=count)
     seen = np.bincount(patches.reshape(-1), padded.reshape(-1), count)
-    keep = (area * CELL_M**2 >= LEAST_AREA_M2) & (seen >= 0.5 * area)
+    keep = (area * CELL_M**2 >= least_area_m2) & (seen >= 0.5 * area)
     keep[0] = False
-    inner = slice(margin, -margin)
-    return np.asarray(keep[patches][inner, inner], np.uint8)
+    patches = patches[margin:-margin, margin:-margin]
+    wide = keep[patches]
+    if not labelled:
+        for patch in np.flatnonzero(keep):
+            cells = (patches == patch) & (found > 0)
+            wide &= (patches != patch) | _flat_part(cells, heights)
+    return np.asarray(wide, np.uint8)
+
+
+def _flat_part(cells: Mask, heights: NDArray[np.float32]) -> Mask:
+    """Cells near the plane that most of them share; none if they share none."""
+    place = np.argwhere(cells) * CELL_M
+    design = np.column_stack([place - place.mean(axis=0), np.ones(len(place))])
+    value = heights[cells].astype(np.float64)
+    off_m = np.abs(value - np.median(value))
+    for _ in range(4):
+        near = off_m <= 2 * np.median(off_m)
+        plane = np.linalg.lstsq(design[near], value[near], rcond=None)[0]
+        off_m = np.abs(value - design @ plane)
+    flat = np.zeros(cells.shape, bool)
+    is_deck = np.median(off_m) < MOST_UNEVEN_M
+    flat[cells] = is_deck & (off_m < LEAST_ABOVE_CAMERA_M)
+    if flat.sum() * CELL_M**2 < LEAST_UNLABELLED_AREA_M2:
+        flat[:] = False
+    return flat
 
 
 def _nearest_values(values: NDArray[np.float32], known: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -86,9 +86,12 @@ class BoxStreet:
 
 
 def _box_hit(origin: Float64, rays: Float64, ranges: Float64) -> Float64:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        sides = (ranges - origin[:, None]) / rays[..., None]
-    enter = np.nanmax(sides.min(axis=-1), axis=-1)
-    leave = np.nanmin(sides.max(axis=-1), axis=-1)
+    enter, leave = np.zeros(rays.shape[:2]), np.full(rays.shape[:2], np.inf)
+    for axis in range(3):
+        # Never 0, so that a ray along a face divides.
+        slope = rays[..., axis] + 1e-12
+        one, other = ((side - origin[axis]) / slope for side in ranges[axis])
+        enter = np.maximum(enter, np.minimum(one, other))
+        leave = np.minimum(leave, np.maximum(one, other))
     hit: Float64 = np.where((enter < leave) & (enter > 0), enter, np.inf)
     return hit

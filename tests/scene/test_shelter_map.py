@@ -57,6 +57,11 @@ def bridge_scene(tmp_path_factory: pytest.TempPathFactory) -> WeatherScene:
     return WeatherScene.build(BoxStreet((DECK, *SCENERY)), folder)
 
 
+@pytest.fixture(scope="module")
+def street_views() -> list[View]:
+    return list(views(StreetClip(frames=6, width=256, height=144)))
+
+
 # What is found
 
 
@@ -80,7 +85,7 @@ def test_a_bridge_is_found_in_noisy_depth() -> None:
     assert cover_at(shelter, 36.0, 0.0) == pytest.approx(5.0, abs=0.3)
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.03, 0.1])
+@pytest.mark.parametrize("noise", [0.02, 0.1])
 @pytest.mark.parametrize("labelled", [True, False])
 def test_facades_crowns_and_cars_are_no_cover(labelled: bool, noise: float) -> None:
     assert map_of(BoxStreet(SCENERY, labelled=labelled, noise=noise)) is None
@@ -88,11 +93,12 @@ def test_facades_crowns_and_cars_are_no_cover(labelled: bool, noise: float) -> N
 
 @pytest.mark.parametrize("noise", [0.0, 0.05])
 @pytest.mark.parametrize("labelled", [True, False])
-def test_a_street_without_bridges_is_open(labelled: bool, noise: float) -> None:
-    clip = StreetClip(frames=8, width=256, height=144)
+def test_a_street_without_bridges_is_open(
+    street_views: list[View], labelled: bool, noise: float
+) -> None:
     rng = np.random.default_rng(5)
     seen = []
-    for view in views(clip):
+    for view in street_views:
         factor = np.maximum(1 + noise * rng.standard_normal(view.depth_m.shape), 0.1)
         label = view.label if labelled else None
         seen.append(View(view.camera, view.depth_m * factor, label))
@@ -109,14 +115,14 @@ def _greatest_heights(table: Any) -> tuple[NDArray[np.int64], NDArray[np.float64
 
 def test_the_greatest_height_of_a_cell_makes_holes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_covered", _greatest_heights)
-    assert map_of(BoxStreet(SCENERY)) is not None
+    assert map_of(BoxStreet(SCENERY, noise=0.1)) is not None
 
 
 def test_without_labels_a_crown_must_not_pass_as_small_cover(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Planted fault: the rules for labels where there are none."""
-    monkeypatch.setattr(module, "LEAST_UNLABELLED_AREA_M2", module.LEAST_AREA_M2)
+    monkeypatch.setattr(module, "LEAST_UNLABELLED_AREA_M2", 0.5 * module.LEAST_AREA_M2)
     assert map_of(BoxStreet(SCENERY, labelled=False, noise=0.02)) is not None
 
 
@@ -225,7 +231,7 @@ def test_a_damaged_map_is_found(bridge_scene: WeatherScene, tmp_path: Path) -> N
     data = bytearray((folder / store.SHELTER).read_bytes())
     data[-1] ^= 1
     (folder / store.SHELTER).write_bytes(data)
-    with pytest.raises(IntegrityError, match="shelter.npy has changed"):
+    with pytest.raises(IntegrityError, match=r"shelter\.npy has changed"):
         WeatherScene.load(folder, verify=True)
     data[200:204] = np.float32(np.nan).tobytes()
     (folder / store.SHELTER).write_bytes(data)

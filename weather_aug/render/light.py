@@ -11,7 +11,7 @@ from weather_aug.clip.types import Frame
 from weather_aug.colour import LUMINANCE, SRGB_LEVELS_LINEAR, linear_from_srgb
 from weather_aug.edit.physical.overcast import MEAN_SKY_GAIN, tone
 from weather_aug.render.medium import FAR_DEPTH_M
-from weather_aug.taxonomy import GROUND, SKY
+from weather_aug.taxonomy import GROUND, ROAD, SKY
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -20,6 +20,12 @@ AIRLIGHT_SATURATION = 0.1
 AIRLIGHT_SRGB = (0.60, 0.88)
 """Range of the airlight's luminance; a recorded sky may be night-blue or burnt out."""
 SAMPLES_PER_SIDE = 96
+CAMERA_HEIGHT_M = 1.5
+"""Over the road, where nothing tells."""
+CAMERA_HEIGHT_RANGE_M = (0.5, 4.0)
+ROAD_RANGE_M = (2.0, 20.0)
+ROAD_SIDE_M = 5.0
+LEAST_ROAD_POINTS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +43,8 @@ class Ambience:
     middle: Float64
     ground: Float64
     airlight: Float64
+    camera_height_m: float = CAMERA_HEIGHT_M
+    """Height of the camera over the road, metres, in [0.5, 4]."""
 
     def under(self, overcast: float) -> Ambience:
         """The same light after the weather's tone, under the whole of the weather's sky."""
@@ -80,7 +88,52 @@ def ambience_of(frame: Frame, axes_world: Float64) -> Ambience:
         middle=np.median(middle, axis=0) if len(middle) else whole,
         ground=np.median(light[is_ground], axis=0) if is_ground.any() else whole,
         airlight=airlight_from_sky(sky),
+        camera_height_m=camera_height_m(frame, axes_world[2]),
     )
+
+
+def camera_height_m(frame: Frame, up_world: Float64) -> float:
+    """Height of the camera over the road, from the points of the road a few metres away.
+
+    What is labelled as road is; without a label the road is the level that most points within 5 m
+    of the camera's way share.
+
+    Returns:
+        Metres in [0.5, 4]; 1.5 where fewer than 20 points tell.
+    """
+    drop_m, is_road = _drops_to_road(frame, up_world)
+    if is_road is not None:
+        drop_m = drop_m[is_road]
+    low, high = CAMERA_HEIGHT_RANGE_M
+    drop_m = drop_m[(drop_m > 0.5 * low) & (drop_m < 1.5 * high)]
+    if len(drop_m) < LEAST_ROAD_POINTS:
+        return CAMERA_HEIGHT_M
+    if is_road is None:
+        level = np.bincount((drop_m / 0.1).astype(np.int64))
+        commonest = np.convolve(level, np.ones(3), "same").argmax()
+        drop_m = drop_m[np.abs(drop_m - 0.1 * (commonest + 0.5)) < 0.25]
+    return float(np.clip(np.median(drop_m), low, high))
+
+
+def _drops_to_road(frame: Frame, up_world: Float64) -> tuple[Float64, NDArray[np.bool_] | None]:
+    """How far points of the near road's strip lie under the camera (N,), and which are labelled."""
+    none = np.zeros(0)
+    if frame.depth_m is None:
+        return none, None
+    camera = frame.camera
+    steps = tuple(-(-side // SAMPLES_PER_SIDE) for side in frame.depth_m.shape)
+    depth = np.asarray(frame.depth_m[:: steps[0], :: steps[1]], np.float64)
+    (fx, fy), (cx, cy) = camera.focal_px, camera.principal_px
+    x = (np.arange(depth.shape[1]) * steps[1] - cx)[None, :] / fx
+    y = (np.arange(depth.shape[0]) * steps[0] - cy)[:, None] / fy
+    near, far = ROAD_RANGE_M
+    with np.errstate(invalid="ignore"):
+        strip = (depth > near) & (depth < far) & (np.abs(x * depth) < ROAD_SIDE_M)
+    up = camera.world_from_camera[:3, :3].T @ up_world
+    drop = -(up[0] * x + up[1] * y + up[2])[strip] * depth[strip]
+    if frame.label is None:
+        return drop, None
+    return drop, np.asarray(frame.label[:: steps[0], :: steps[1]] == ROAD)[strip]
 
 
 def _sky_colour(light: Float64, is_sky: NDArray[np.bool_]) -> Float64:

@@ -25,6 +25,7 @@ from weather_aug.errors import (
 from weather_aug.render.light import ambience_of
 from weather_aug.scene import store
 from weather_aug.scene.policy import TYPES
+from weather_aug.scene.shelter import View, shelter_of
 
 EDITORS = ("physical",)
 JOURNAL = "journal.jsonl"
@@ -87,18 +88,47 @@ def _content(
 ) -> dict[str, Any]:
     """Write all frames into `work`; what the manifest says of them."""
     entries, files = _write_frames(clip, work, progress)
+    axes_world = street_axes(entries, clip.up_world)
+    shelter = None
     airlight = None
     if getattr(clip, "is_drive", True):
         airlight = np.median([entry["light"]["airlight"] for entry in entries], axis=0).tolist()
+        shelter, file = _write_shelter(work, entries, axes_world)
+        files |= file
     return {
         "name": clip.name,
         "editor": editor,
         "weathers": list(weathers),
-        "axes_world": street_axes(entries, clip.up_world).tolist(),
+        "axes_world": axes_world.tolist(),
         "airlight": airlight,
+        "shelter": shelter,
         "frames": entries,
         "files": files,
     }
+
+
+def _write_shelter(
+    work: Path, entries: Sequence[dict[str, Any]], axes_world: Float64
+) -> tuple[dict[str, Any] | None, dict[str, Any]]:
+    """Map the covers that the finished frames show; the manifest's entry, and the file's digest.
+
+    From the stored frames, so that a build that is continued makes the same map.
+    """
+    # A build that was cut short after the map may have shown covers that are gone now.
+    with _files.reported(work):
+        (work / store.SHELTER).unlink(missing_ok=True)
+    records = [store.parse_frame(entry) for entry in entries]
+    views = (View(record.camera, *store.read_surfaces(work, record)) for record in records)
+    shelter = shelter_of(views, axes_world)
+    if shelter is None:
+        return None, {}
+    record, data = store.encode_shelter(shelter)
+    _files.write_whole(work / store.SHELTER, data)
+    return record, {store.SHELTER: _digest(data)}
+
+
+def _digest(data: bytes) -> dict[str, Any]:
+    return {"size": len(data), "sha256": _files.sha256_of(data)}
 
 
 def street_axes(entries: Sequence[dict[str, Any]], up_world: Float64) -> Float64:
@@ -289,10 +319,7 @@ def _stored(frame: Frame, up_world: Float64) -> tuple[dict[str, Any], dict[str, 
         store.part_path(frame.key, part): data for part, data in store.encode_frame(frame).items()
     }
     entry = store.frame_record(frame, ambience)
-    files = {
-        relative: {"size": len(data), "sha256": _files.sha256_of(data)}
-        for relative, data in parts.items()
-    }
+    files = {relative: _digest(data) for relative, data in parts.items()}
     return {"entry": entry, "files": files}, parts
 
 

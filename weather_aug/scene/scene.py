@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from weather_aug.clip.types import Clip, Frame, FrameKey
 from weather_aug.errors import ArgumentError, IntegrityError, printable
 from weather_aug.particles.field import Window
+from weather_aug.particles.shelter import Shelter
 from weather_aug.render.compose import DEFAULT_OPTIONS, RenderedFrame, RenderOptions, render
 from weather_aug.render.light import Ambience
 from weather_aug.scene import store
@@ -108,10 +109,21 @@ class WeatherScene:
         The airlight is the clip's too if it is a drive: fog does not flicker. Of unrelated pictures
         each has its own.
         """
+        key = FrameKey(*key)
         light = dict(self._record(key).light)
         if self.manifest.airlight is not None:
             light["airlight"] = self.manifest.airlight
-        return Ambience(self.manifest.axes_world, **light)
+        height_m = self.manifest.camera_height_m(key.camera)
+        return Ambience(self.manifest.axes_world, **light, camera_height_m=height_m)
+
+    @cached_property
+    def shelter(self) -> Shelter | None:
+        """Bridges and roofs over the street; None where the sky is open everywhere.
+
+        Raises:
+            SceneError: If the map's file cannot be read any more.
+        """
+        return store.read_shelter(self.path, self.manifest)
 
     def render(
         self,

@@ -4,6 +4,7 @@
     frames/000012_front.png             the recorded picture, lossless
     frames/000012_front.depth.npy       (H, W) float16 z-depth, metres, inf for the sky
     frames/000012_front.label.npy       (H, W) uint8 train ids, where the clip is labelled
+    shelter.npy                         (A, L) float32 undersides over the street, if there are any
 
 Data only: nothing in it can run code, every file has its size and SHA-256 in the manifest, and the
 manifest has its own.
@@ -24,16 +25,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug import _files
+from weather_aug._checks import MAX_PIXELS
 from weather_aug._png import png_bytes
 from weather_aug.clip.types import RIGID_TOLERANCE, Camera, Frame, FrameKey
-from weather_aug.errors import DataError, IntegrityError, SceneError, printable
-from weather_aug.render.light import Ambience
+from weather_aug.errors import ArgumentError, DataError, IntegrityError, SceneError, printable
+from weather_aug.particles.shelter import CELL_M, Shelter
+from weather_aug.render.light import CAMERA_HEIGHT_M, CAMERA_HEIGHT_RANGE_M, Ambience
 from weather_aug.taxonomy import CLASSES, IGNORE
 
 FORMAT = "weather_aug scene"
 VERSION = 1
 MANIFEST = "scene.json"
 FRAMES = "frames"
+SHELTER = "shelter.npy"
 LIGHTS = ("sky", "middle", "ground", "airlight")
 MAX_FRAMES = 20_000
 MAX_MANIFEST_BYTES = 64 * 2**20
@@ -43,7 +47,7 @@ LARGEST = 1e10
 """No coordinate (metres, pixels), speed or time (seconds) of a drive is greater."""
 
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
-_DEPTH, _LABEL = "<f2", "|u1"
+_DEPTH, _LABEL, _COVER = "<f2", "|u1", "<f4"
 _PNG_START = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
 _MALFORMED = (
     *(KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError),
@@ -70,6 +74,17 @@ class FrameRecord:
     """Linear RGB of `sky`, `middle` and `ground` (medians) and of the frame's own `airlight`."""
     files: Mapping[str, str]
     """Relative path by part: `image`, `depth`, and `label` where there is one."""
+    camera_height_m: float = CAMERA_HEIGHT_M
+    """Over the road, as this frame shows it."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShelterRecord:
+    """What the manifest says of the map of covers."""
+
+    origin_m: NDArray[np.float64]
+    cell_m: float
+    shape: tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +99,23 @@ class Manifest:
     """Of the whole drive, linear RGB; None where pictures are unrelated and each has its own."""
     frames: tuple[FrameRecord, ...]
     files: Mapping[str, StoredFile]
+    shelter: ShelterRecord | None = None
     digest: str = ""
     """SHA-256 of the manifest's bytes; it names the scene's content, since it lists all digests."""
     by_key: Mapping[FrameKey, FrameRecord] = field(init=False)
+    _height_by_camera_m: Mapping[str, float] = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "by_key", {record.key: record for record in self.frames})
+        heights: dict[str, list[float]] = {}
+        for record in self.frames:
+            heights.setdefault(record.key.camera, []).append(record.camera_height_m)
+        median = {camera: float(np.median(values)) for camera, values in heights.items()}
+        object.__setattr__(self, "_height_by_camera_m", median)
+
+    def camera_height_m(self, camera: str) -> float:
+        """Height of a camera over the road, metres: the median of its frames."""
+        return self._height_by_camera_m[camera]
 
 
 def check_name(what: str, name: Any) -> str:
@@ -138,8 +164,20 @@ def frame_record(frame: Frame, ambience: Ambience) -> dict[str, Any]:
         "velocity_m_per_s": camera.velocity_m_per_s.tolist(),
         "angular_velocity_rad_per_s": camera.angular_velocity_rad_per_s.tolist(),
         "light": {name: getattr(ambience, name).tolist() for name in LIGHTS},
+        "camera_height_m": ambience.camera_height_m,
         "files": {part: part_path(frame.key, part) for part in parts},
     }
+
+
+def encode_shelter(shelter: Shelter) -> tuple[dict[str, Any], bytes]:
+    """The manifest's entry for a map of covers, as JSON values, and the bytes of its file."""
+    record = {
+        "file": SHELTER,
+        "origin_m": shelter.origin_m.tolist(),
+        "cell_m": shelter.cell_m,
+        "shape": list(shelter.cover_m.shape),
+    }
+    return record, _npy(shelter.cover_m, _COVER)
 
 
 def manifest_bytes(content: dict[str, Any]) -> bytes:
@@ -219,15 +257,43 @@ def read_frame(folder: Path, record: FrameRecord) -> Frame:
     Raises:
         SceneError: If a file of it cannot be read.
     """
+    image = _picture(folder / record.files["image"], record.camera)
+    depth, label = read_surfaces(folder, record)
+    return Frame(record.key, record.time_s, record.camera, image, label, depth)
+
+
+def read_surfaces(
+    folder: Path, record: FrameRecord
+) -> tuple[NDArray[Any], NDArray[np.uint8] | None]:
+    """Depth and label of one frame, memory-mapped.
+
+    Raises:
+        SceneError: If a file of it cannot be read.
+    """
+    shape = (record.camera.height, record.camera.width)
     label = record.files.get("label")
-    return Frame(
-        record.key,
-        record.time_s,
-        record.camera,
-        _picture(folder / record.files["image"], record.camera),
-        None if label is None else _mapped(folder / label, _LABEL, record.camera),
-        _mapped(folder / record.files["depth"], _DEPTH, record.camera),
+    return (
+        _mapped(folder / record.files["depth"], _DEPTH, shape),
+        None if label is None else _mapped(folder / label, _LABEL, shape),
     )
+
+
+def read_shelter(folder: Path, manifest: Manifest) -> Shelter | None:
+    """The map of covers; None where the scene has none.
+
+    Raises:
+        SceneError: If its file cannot be read.
+    """
+    record = manifest.shelter
+    if record is None:
+        return None
+    cover_m = _mapped(folder / SHELTER, _COVER, record.shape)
+    try:
+        return Shelter(cover_m, record.origin_m, manifest.axes_world, record.cell_m)
+    except ArgumentError as error:
+        raise SceneError(
+            f"{printable(folder / SHELTER, 200)}: {error}; build the scene again"
+        ) from None
 
 
 def check_scale(key: FrameKey, camera: Camera, time_s: float) -> None:
@@ -281,8 +347,7 @@ def _picture(path: Path, camera: Camera) -> NDArray[np.uint8]:
     return np.asarray(image, np.uint8)
 
 
-def _mapped(path: Path, dtype: str, camera: Camera) -> NDArray[Any]:
-    shape = (camera.height, camera.width)
+def _mapped(path: Path, dtype: str, shape: tuple[int, int]) -> NDArray[Any]:
     header = _npy_header(dtype, shape)
     try:
         with path.open("rb") as file:
@@ -316,7 +381,7 @@ def _parse(content: Any, path: Path) -> Manifest:
         str(relative): StoredFile(int(entry["size"]), str(entry["sha256"]))
         for relative, entry in content["files"].items()
     }
-    frames = tuple(_parse_frame(entry) for entry in content["frames"])
+    frames = tuple(parse_frame(entry) for entry in content["frames"])
     if not frames or len({record.key for record in frames}) < len(frames):
         raise SceneError(f"{printable(path, 200)} has no frames, or one twice; build it again")
     for record in frames:
@@ -331,11 +396,13 @@ def _parse(content: Any, path: Path) -> Manifest:
         airlight=None if content["airlight"] is None else _light(content["airlight"]),
         frames=frames,
         files=files,
+        shelter=_parse_shelter(content.get("shelter"), files),
         digest=_files.sha256_of_file(path),
     )
 
 
-def _parse_frame(entry: Any) -> FrameRecord:
+def parse_frame(entry: Any) -> FrameRecord:
+    """A frame's record from the manifest's entry; whatever is malformed raises."""
     camera = Camera(
         intrinsics=entry["intrinsics"],
         world_from_camera=entry["world_from_camera"],
@@ -353,7 +420,25 @@ def _parse_frame(entry: Any) -> FrameRecord:
     key = FrameKey(int(entry["time_index"]), check_name("camera", entry["camera"]))
     time_s = float(entry["time_s"])
     check_scale(key, camera, time_s)
-    return FrameRecord(key, time_s, camera, light, files)
+    # Scenes of before it was measured have none.
+    height_m = float(entry.get("camera_height_m", CAMERA_HEIGHT_M))
+    if not CAMERA_HEIGHT_RANGE_M[0] <= height_m <= CAMERA_HEIGHT_RANGE_M[1]:
+        raise ValueError("camera_height_m is out of its range")
+    return FrameRecord(key, time_s, camera, light, files, height_m)
+
+
+def _parse_shelter(entry: Any, files: Mapping[str, StoredFile]) -> ShelterRecord | None:
+    if entry is None:
+        return None
+    shape = (int(entry["shape"][0]), int(entry["shape"][1]))
+    if entry["file"] != SHELTER or SHELTER not in files or len(entry["shape"]) != 2:
+        raise ValueError("the shelter map has no file, or another shape")
+    if not 0 < min(shape) <= max(shape) <= MAX_PIXELS // min(shape):
+        raise ValueError("the shelter map is empty, or too large")
+    cell_m = float(entry["cell_m"])
+    if cell_m != CELL_M:
+        raise ValueError("the shelter map has cells of another size")
+    return ShelterRecord(_array(entry["origin_m"], (3,)), cell_m, shape)
 
 
 def _axes(value: Any) -> NDArray[np.float64]:

@@ -83,6 +83,7 @@ def particles_in_view(
         leaning[k] = view.reach_m * np.sqrt(1.0 + view.picture[k] * view.picture[k])
     start = np.empty(3)
     p = np.empty(3)
+    tilted = np.empty((3, 3))
     for i in range(count):
         word = mix64(key + np.uint64(i + 1) * GOLDEN)
         place = mix64(word)
@@ -112,7 +113,7 @@ def particles_in_view(
         row[0], row[1], row[2] = x, y, z
         row[3:6] = np.float32(0.0)
         third = 3 * i // count
-        row[12] = _write_attributes(word, third, low_m + start, attributes, m, row)
+        row[12] = _write_attributes(word, third, p, attributes, m, tilted, row)
         found += 1
     return found
 
@@ -121,12 +122,17 @@ def particles_in_view(
 def _write_attributes(
     word: np.uint64,
     third: int,
-    start: Float64,
+    position: Float64,
     attributes: Attributes,
     camera_from_box: Float64,
+    tilted: Float64,
     row: Float32,
 ) -> float:
-    """Draw one particle: write its covariance in camera axes, return its opacity."""
+    """Draw one particle: write its covariance in camera axes, return its opacity.
+
+    `tilted` is room for a (3, 3): its own axes as columns, in camera axes. The opacity of fog is
+    that of time 0, because a fall changes neither coordinate it depends on.
+    """
     first = mix64(word ^ np.uint64(0xD6E8FEB86659FD93))
     second = mix64(first + GOLDEN)
     third_word = mix64(second + GOLDEN)
@@ -144,30 +150,21 @@ def _write_attributes(
     # A right-handed turn about axis k carries axis k + 1 towards axis k + 2.
     still = attributes.tilt_axis
     one, two = (still + 1) % 3, (still + 2) % 3
-    sums = np.zeros(6)
-    for axis in range(3):
-        along = np.zeros(3)
-        if axis == still:
-            along[still] = 1.0
-        elif axis == one:
-            along[one], along[two] = cosine, sine
-        else:
-            along[one], along[two] = -sine, cosine
-        seen = np.zeros(3)
-        for r in range(3):
+    for r in range(3):
+        at = camera_from_box[r]
+        tilted[r, still] = at[still]
+        tilted[r, one] = cosine * at[one] + sine * at[two]
+        tilted[r, two] = cosine * at[two] - sine * at[one]
+    slot = 6
+    for r in range(3):
+        for c in range(r, 3):
+            total = 0.0
             for k in range(3):
-                seen[r] += camera_from_box[r, k] * along[k]
-        s2 = variances[axis]
-        sums[0] += s2 * seen[0] * seen[0]
-        sums[1] += s2 * seen[0] * seen[1]
-        sums[2] += s2 * seen[0] * seen[2]
-        sums[3] += s2 * seen[1] * seen[1]
-        sums[4] += s2 * seen[1] * seen[2]
-        sums[5] += s2 * seen[2] * seen[2]
-    for k in range(6):
-        row[6 + k] = sums[k]
+                total += variances[k] * tilted[r, k] * tilted[c, k]
+            row[slot] = total
+            slot += 1
     if attributes.opacity_per_m > 0.0:
-        depth_m = max(start[attributes.forward_axis], 2.0 * abs(start[0]))
+        depth_m = max(position[attributes.forward_axis], 2.0 * abs(position[0]))
         return -np.expm1(-attributes.opacity_per_m * depth_m)
     opacity = attributes.opacity_mean + attributes.opacity_std * opacity_draw
     return min(max(opacity, 0.0), 1.0)

@@ -87,10 +87,15 @@ def air_of(weather: Weather, time_s: float, seed: int) -> Air:
 def gust(time_s: float, seed: int) -> float:
     """Gust at `time_s` in units of its root mean square, in [-sqrt(6), sqrt(6)], mean 0.
 
+    Raises:
+        ArgumentError: If the time is not finite or no seconds, or the seed is no integer.
+
     Source:
-        Three sines of periods between 5 and 25 s, of equal power and with phases keyed by the seed
-        [G]; it stands for the gusts that pass a car in seconds, not for a turbulence spectrum.
+        Our choice: three sines of periods between 5 and 25 s, of equal power, with phases keyed by
+        the seed. They stand for the gusts that pass a car in seconds, not for a turbulence
+        spectrum.
     """
+    time_s = checked_time("time_s", time_s)
     return _AMPLITUDE * sum(
         math.sin(rad_per_s * time_s + phase)
         for rad_per_s, phase in zip(_RAD_PER_S, _phases(check_seed("seed", seed)), strict=True)
@@ -108,7 +113,8 @@ def gust_moments_s(start_s: float, end_s: float, seed: int) -> tuple[float, floa
     u runs from 0 at `start_s` to 1 at `end_s`. They give the drift in a wind and a gustiness that
     change linearly, because their product is a quadratic in u.
     """
-    span_s = end_s - start_s
+    start_s = checked_time("start_s", start_s)
+    span_s = checked_time("end_s", end_s) - start_s
     scale = span_s * _AMPLITUDE
     totals = [0.0, 0.0, 0.0]
     for rad_per_s, phase in zip(_RAD_PER_S, _phases(check_seed("seed", seed)), strict=True):

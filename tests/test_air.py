@@ -112,7 +112,7 @@ def _assert_moments_match_quadrature(start_s: float, span_s: float, seed: int) -
     span_s = (start_s + span_s) - start_s
     for k in range(3):
         expected = span_s * float((share * values * u**k).sum())
-        assert abs(expected - actual[k]) <= 2e-12 * abs(span_s)
+        assert abs(expected - actual[k]) <= 2e-12 * abs(span_s) + 1e-300  # denormal spans
 
 
 @given(st.tuples(*[st.floats(-500, 500)] * 3), seeds)

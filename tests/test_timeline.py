@@ -136,7 +136,7 @@ def _assert_is_quadrature(timeline: WeatherTimeline, time_s: float, seed: int) -
                 scale += weight * max(map(abs, rates))
     air = timeline.air(time_s, seed)
     found = np.array([*air.drift_m, air.wet_s])
-    assert np.abs(np.sign(time_s) * total - found).max() <= 1e-9 * scale
+    assert np.abs(np.sign(time_s) * total - found).max() <= 1e-9 * scale + 1e-300  # denormal times
 
 
 @given(timelines(), st.floats(-80, 200), seeds)

@@ -20,6 +20,7 @@ from weather_aug.weather import (
     fog_severity,
     parse_severity,
     rain_severity,
+    shape_ends,
     snow_severity,
     visibility_from_severity,
 )
@@ -33,10 +34,13 @@ TABLE = {
     ("rain", "mist_per_km"): (0.2, 0.6, 2.0, 5.0),
     ("rain", "wetness"): (0.5, 0.8, 1, 1),
     ("rain", "overcast"): (0.6, 0.8, 1, 1),
+    ("rain", "gustiness"): (0.3, 0.3, 0.3, 0.3),
+    ("rain", "spray_per_km"): (0.5, 2, 10, 25),
     ("snow", "snow_mm_per_h"): (0.4, 1, 2, 4),
     ("snow", "mist_per_km"): (0.3, 0.8, 2, 5),
     ("snow", "snow_cover"): (0.25, 0.6, 0.9, 1),
     ("snow", "overcast"): (0.6, 0.8, 1, 1),
+    ("snow", "gustiness"): (0.25, 0.25, 0.25, 0.25),
     ("fog", "fog_per_m"): (0.005, 0.01, 0.02, 0.06),
     ("fog", "overcast"): (0.6, 0.8, 1, 1),
 }
@@ -58,7 +62,18 @@ weathers = st.builds(
     snow_cover=unit,
     overcast=unit,
     wind_m_per_s=st.tuples(wind, wind, wind),
+    gustiness=unit,
+    snow_wetness=unit,
+    fog_patchiness=unit,
+    fog_puffs=st.floats(0, 0.5),
+    spray_per_km=st.floats(0, 200),
 )
+THING = {
+    "snow_wetness": {"snow_mm_per_h": 1.0},
+    "fog_patchiness": {"visibility_m": 200.0},
+    "fog_puffs": {"visibility_m": 200.0},
+}
+"""What each field shapes."""
 
 
 def _close(expected: float, actual: float, relative: float) -> bool:
@@ -108,6 +123,7 @@ def test_below_light_quantities_fall_to_zero_by_their_power(
     [
         ("rain", "rain_mm_per_h"),
         ("rain", "mist_per_km"),
+        ("rain", "spray_per_km"),
         ("snow", "snow_mm_per_h"),
         ("snow", "mist_per_km"),
         ("snow", "snow_cover"),
@@ -123,7 +139,7 @@ def test_units_rise_strictly_with_severity(kind: str, name: str) -> None:
 def test_nothing_falls_with_severity(kind: str) -> None:
     """Quantities that saturate (wetness, clouds) and the wind stay or rise; ranges shrink."""
     states = [FACTORY[kind](s) for s in GRID]
-    for name in ("wetness", "snow_cover", "overcast"):
+    for name in ("wetness", "snow_cover", "overcast", "gustiness"):
         values = [getattr(state, name) for state in states]
         assert all(a <= b for a, b in itertools.pairwise(values)), name
     speeds = [math.hypot(*state.wind_m_per_s) for state in states]
@@ -141,8 +157,9 @@ def test_severity_zero_is_clear(kind: str) -> None:
 
 
 def test_wind_alone_and_a_height_without_fog_are_clear() -> None:
-    assert Weather(wind_m_per_s=(3, 2, 1), fog_scale_height_m=50).is_clear
-    for name in ("rain_mm_per_h", "snow_mm_per_h", "mist_per_km"):
+    assert Weather(wind_m_per_s=(3, 2, 1), gustiness=1, fog_scale_height_m=50).is_clear
+    assert Weather(snow_wetness=1, fog_patchiness=1, fog_puffs=0.5).is_clear
+    for name in ("rain_mm_per_h", "snow_mm_per_h", "mist_per_km", "spray_per_km"):
         assert not Weather(**{name: 0.1}).is_clear
     for name in ("wetness", "snow_cover", "overcast"):
         assert not Weather(**{name: 0.1}).is_clear
@@ -173,7 +190,7 @@ def test_beyond_extreme_the_severity_is_cut_and_the_unit_kept() -> None:
 @given(st.floats(0.01, 1))
 def test_a_unit_brings_what_its_severity_brings(s: float) -> None:
     given_in_units = Weather.rain(mm_per_h=Weather.rain(s).rain_mm_per_h)
-    for field in ("mist_per_km", "wetness", "overcast"):
+    for field in ("mist_per_km", "spray_per_km", "wetness", "overcast", "gustiness"):
         assert _close(getattr(Weather.rain(s), field), getattr(given_in_units, field), 1e-8)
 
 
@@ -193,7 +210,8 @@ def test_overrides_replace_what_comes_with_the_weather() -> None:
 @pytest.mark.parametrize("kind", ["rain", "snow"])
 def test_not_falling_leaves_the_ground_and_the_sky(kind: str) -> None:
     falls, fell = FACTORY[kind]("heavy"), FACTORY[kind]("heavy", falling=False)
-    assert fell == replace(falls, **{f"{kind}_mm_per_h": 0.0, "mist_per_km": 0.0})
+    in_the_air = {f"{kind}_mm_per_h": 0.0, "mist_per_km": 0.0, "spray_per_km": 0.0}
+    assert fell == replace(falls, **in_the_air)
     assert fell.overcast > 0
     assert not fell.is_clear
 
@@ -219,8 +237,8 @@ def test_blend_runs_one_way_between_its_ends(a: Weather, b: Weather, t: float, u
 
 def _quantities(state: Weather) -> dict[str, float]:
     """What a transition runs through: rates, shares, extinctions, wind."""
-    plain = ("rain_mm_per_h", "snow_mm_per_h", "mist_per_km", "wetness", "snow_cover", "overcast")
     inverse = ("visibility_m", "fog_scale_height_m")
+    plain = (f.name for f in fields(Weather) if f.name not in (*inverse, "wind_m_per_s"))
     return (
         {name: getattr(state, name) for name in plain}
         | {name: 1 / getattr(state, name) for name in inverse}
@@ -232,6 +250,41 @@ def test_blend_half_way_is_half_of_each_rate_and_extinction() -> None:
     half = Weather.blend(Weather.clear(), Weather(rain_mm_per_h=10, visibility_m=200), 0.5)
     assert half.rain_mm_per_h == 5
     assert half.visibility_m == pytest.approx(400)
+
+
+@given(weathers, unit)
+def test_a_blend_of_equal_weathers_is_that_weather(state: Weather, t: float) -> None:
+    assert Weather.blend(state, replace(state), t) == state
+
+
+@pytest.mark.parametrize(("name", "thing"), THING.items(), ids=THING)
+@pytest.mark.parametrize("t", [1e-9, 0.3, 1 - 1e-9])
+def test_a_shape_holds_where_only_one_side_has_its_thing(
+    name: str, thing: dict[str, float], t: float
+) -> None:
+    """A flake must not grow wet because the weather without snow says 0.4."""
+    has, has_not = Weather(**thing, **{name: 0.1}), Weather(**{name: 0.4})
+    assert getattr(Weather.blend(has, has_not, t), name) == 0.1
+    assert getattr(Weather.blend(has_not, has, t), name) == 0.1
+
+
+@pytest.mark.parametrize(("name", "thing"), THING.items(), ids=THING)
+def test_a_shape_runs_linearly_where_both_or_none_has_its_thing(
+    name: str, thing: dict[str, float]
+) -> None:
+    """Not weighted by the amounts, which would bend a transition of snow to more snow."""
+    for some, more in (({}, {}), (thing, {k: 3 * v for k, v in thing.items()})):
+        a, b = Weather(**some, **{name: 0.1}), Weather(**more, **{name: 0.4})
+        for t in (0.25, 0.5, 0.75):
+            assert getattr(Weather.blend(a, b, t), name) == pytest.approx(0.1 + 0.3 * t)
+
+
+@given(weathers, weathers, st.floats(1e-9, 1 - 1e-9), st.sampled_from([*THING]))
+def test_shape_ends_are_the_limits_of_a_blend(a: Weather, b: Weather, t: float, name: str) -> None:
+    assume(a != b)
+    start, end = shape_ends(a, b, name)
+    between = getattr(Weather.blend(a, b, t), name)
+    assert math.isclose(start + t * (end - start), between, abs_tol=1e-15)
 
 
 @given(weathers, weathers)
@@ -268,6 +321,40 @@ def test_mixed_fog_has_the_height_that_its_extinctions_weigh() -> None:
     assert Weather.mix(low, high).fog_scale_height_m == pytest.approx(1 / inverse)
 
 
+@pytest.mark.parametrize(
+    ("name", "some", "thrice"),
+    [
+        ("snow_wetness", {"snow_mm_per_h": 1.0}, {"snow_mm_per_h": 3.0}),
+        ("fog_patchiness", {"visibility_m": 300.0}, {"visibility_m": 100.0}),
+        ("fog_puffs", {"visibility_m": 300.0}, {"visibility_m": 100.0}),
+    ],
+)
+def test_a_mixed_shape_is_weighted_by_its_thing(
+    name: str, some: dict[str, float], thrice: dict[str, float]
+) -> None:
+    a, b = Weather(**some, **{name: 0.4}), Weather(**thrice, **{name: 0.2})
+    assert getattr(Weather.mix(a, b), name) == pytest.approx(0.25)
+    assert getattr(Weather.mix(a, Weather(**{name: 0.5})), name) == 0.4
+    assert getattr(Weather.mix(Weather(**{name: 0.1}), Weather(**{name: 0.4})), name) == 0.4
+
+
+def test_mixed_gusts_are_of_the_stronger_wind_and_spray_adds() -> None:
+    breeze = Weather(wind_m_per_s=(0, 2, 0), gustiness=0.9, spray_per_km=3)
+    gale = Weather(wind_m_per_s=(-9, 0, 0), gustiness=0.2, spray_per_km=4)
+    both = Weather.mix(breeze, gale)
+    assert (both.wind_m_per_s, both.gustiness) == (gale.wind_m_per_s, 0.2)
+    assert both.spray_per_km == 7
+    assert Weather.mix(both, Weather(spray_per_km=199)).spray_per_km == 200
+    calm = Weather(wind_m_per_s=(0, 2, 0), gustiness=0.1)
+    assert Weather.mix(breeze, calm).gustiness == Weather.mix(calm, breeze).gustiness == 0.9
+
+
+def test_fog_has_nothing_new() -> None:
+    for s in GRID:
+        fog = Weather.fog(s)
+        assert not any(getattr(fog, name) for name in (*THING, "gustiness", "spray_per_km"))
+
+
 def test_fog_per_m_is_koschmieder() -> None:
     assert math.exp(-Weather(visibility_m=123).fog_per_m * 123) == pytest.approx(0.05)
     assert Weather().fog_per_m == 0
@@ -283,6 +370,19 @@ def test_json_gives_an_equal_weather_back(state: Weather) -> None:
 def test_json_names_every_field() -> None:
     assert list(Weather().to_dict()) == [field.name for field in fields(Weather)]
     assert Weather.from_dict({}) == Weather()
+
+
+OLD_RECORD = (
+    '{"rain_mm_per_h": 20.0, "snow_mm_per_h": 0.0, "visibility_m": null, "fog_scale_height_m": '
+    'null, "mist_per_km": 2.0, "wetness": 1.0, "snow_cover": 0.0, "overcast": 1.0, "wind_m_per_s": '
+    "[0.0, 6.0, 0.0]}"
+)
+"""Heavy rain as it was written before air had gusts."""
+
+
+def test_an_older_record_is_read_with_nothing_new() -> None:
+    plain = Weather.rain("heavy", gustiness=0, spray_per_km=0)
+    assert Weather.from_json(OLD_RECORD) == plain
 
 
 def test_a_weather_is_a_value() -> None:
@@ -311,6 +411,11 @@ BAD_FIELDS: list[tuple[str, Any]] = [
     ("wetness", 1.01),
     ("snow_cover", -0.01),
     ("overcast", 2),
+    ("gustiness", 1.01),
+    ("snow_wetness", -0.01),
+    ("fog_patchiness", 1.01),
+    ("fog_puffs", 0.51),
+    ("spray_per_km", 201),
     ("wind_m_per_s", (0, 0)),
     ("wind_m_per_s", 3.0),
     ("wind_m_per_s", "abc"),

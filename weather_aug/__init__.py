@@ -21,6 +21,7 @@ _HOMES = {
     "RenderedFrame": "weather_aug.render.compose",
     "WeatherScene": "weather_aug.scene.scene",
     "WeatherPolicy": "weather_aug.scene.policy",
+    "WeatherTimeline": "weather_aug.timeline",
     "WeatherDataset": "weather_aug.transforms.dataset",
     "WeatherAugError": "weather_aug.errors",
 }
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from weather_aug.render.compose import RenderOptions as RenderOptions
     from weather_aug.scene.policy import WeatherPolicy as WeatherPolicy
     from weather_aug.scene.scene import WeatherScene as WeatherScene
+    from weather_aug.timeline import WeatherTimeline as WeatherTimeline
     from weather_aug.transforms.dataset import WeatherDataset as WeatherDataset
     from weather_aug.weather import Weather as Weather
 

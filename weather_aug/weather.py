@@ -31,7 +31,10 @@ class Weather:
         the clip's first heading, to its left, up). Severity s in [0, 1] names a physical state, it
         is not part of it: light 0.25, moderate 0.5, heavy 0.75, extreme 1; between the stops all
         quantities are log-linear in s, below light they fall to 0 with s squared (fog extinction:
-        with s), so that s = 0 is clear.
+        with s), so that s = 0 is clear. A Weather is a state at one moment and knows no time: how
+        its gusts blow and how far they carry the air is `weather_aug.air`, how weather changes is
+        `WeatherTimeline`. Gustiness, snow wetness, fog patchiness and fog puffs only shape the
+        wind, snow and fog that are there; without those they mean nothing.
 
     Raises:
         ArgumentError: If a field is outside its range.
@@ -58,7 +61,17 @@ class Weather:
     overcast: float = 0.0
     """From the recorded sky (0) to a closed cloud deck (1)."""
     wind_m_per_s: Wind = (0.0, 0.0, 0.0)
-    """(along the first heading, to its left, up), each in [-60, 60]."""
+    """Mean wind (along the first heading, to its left, up), each in [-60, 60]."""
+    gustiness: float = 0.0
+    """Root mean square of the gusts as a share of the mean wind, in [0, 1]."""
+    snow_wetness: float = 0.0
+    """Of the falling flakes, from dry (0) to melting (1); wet flakes fall faster, sway less."""
+    fog_patchiness: float = 0.0
+    """How uneven the fog is, in [0, 1]: kappa of a log-normal fractal noise of mean 1."""
+    fog_puffs: float = 0.0
+    """Share of the fog's extinction that drifting Gaussian puffs carry, in [0, 0.5]."""
+    spray_per_km: float = 0.0
+    """Extinction of spray at the road, in [0, 200] per km; thins with a scale height of 0.5 m."""
 
     def __post_init__(self) -> None:
         for name, (low, high) in _RANGES.items():
@@ -66,11 +79,7 @@ class Weather:
             if not low <= value <= high:
                 raise ArgumentError(f"{name} must be in [{low:g}, {high:g}], got {value!r}")
             object.__setattr__(self, name, value)
-        try:
-            along, left, up = self.wind_m_per_s
-        except (TypeError, ValueError):
-            raise ArgumentError("wind_m_per_s must be three numbers (along, left, up)") from None
-        wind = tuple(finite("wind_m_per_s", v, -60, 60) for v in (along, left, up))
+        wind = along_left_up("wind_m_per_s", self.wind_m_per_s, _STRONGEST_WIND_M_PER_S)
         object.__setattr__(self, "wind_m_per_s", wind)
 
     @classmethod
@@ -87,7 +96,7 @@ class Weather:
         falling: bool = True,
         **overrides: Any,
     ) -> Weather:
-        """Rain, with the mist, wetness, overcast sky and wind that come with it.
+        """Rain, with the mist, spray, wetness, overcast sky and gusty wind that come with it.
 
         Args:
             severity: In [0, 1] or a name (light, moderate, heavy, extreme).
@@ -102,9 +111,11 @@ class Weather:
             "wetness": _WETNESS.at(s),
             "overcast": _RAIN_OVERCAST.at(s),
             "wind_m_per_s": (0.0, _RAIN_WIND.at(s), 0.0),
+            "gustiness": _RAIN_GUSTINESS.at(s),
+            "spray_per_km": _RAIN_SPRAY.at(s),
         }
         if not falling:
-            state |= {"rain_mm_per_h": 0.0, "mist_per_km": 0.0}
+            state |= {"rain_mm_per_h": 0.0, "mist_per_km": 0.0, "spray_per_km": 0.0}
         return _build(cls, state, overrides)
 
     @classmethod
@@ -116,7 +127,7 @@ class Weather:
         falling: bool = True,
         **overrides: Any,
     ) -> Weather:
-        """Snowfall, with the blowing snow, ground cover, overcast sky and wind that come with it.
+        """Dry snowfall, with the blowing snow, ground cover, clouds and gusty wind of its rate.
 
         Args:
             severity: In [0, 1] or a name (light, moderate, heavy, extreme).
@@ -131,6 +142,7 @@ class Weather:
             "snow_cover": _SNOW_COVER.at(s),
             "overcast": _SNOW_OVERCAST.at(s),
             "wind_m_per_s": (0.0, _SNOW_WIND.at(s), 0.0),
+            "gustiness": _SNOW_GUSTINESS.at(s),
         }
         if not falling:
             state |= {"snow_mm_per_h": 0.0, "mist_per_km": 0.0}
@@ -163,22 +175,38 @@ class Weather:
 
     @staticmethod
     def blend(a: Weather, b: Weather, t: float) -> Weather:
-        """The transition from `a` (t = 0) to `b` (t = 1); rates and extinctions run linearly."""
+        """The transition from `a` (t = 0) to `b` (t = 1); rates and extinctions run linearly.
+
+        What shapes the snow or the fog (its wetness, patchiness, puffs) runs linearly too where
+        both sides have it; where only one has, it holds for the whole blend, so that snow that
+        fades does not turn wet or dry on the way.
+        """
         t = finite("t", t, 0, 1)
-        if t in (0.0, 1.0):
-            return b if t else a
-        return _combine(a, b, 1.0 - t, t)
+        if t in (0.0, 1.0) or a == b:
+            return b if t == 1.0 else a
+        shapes: dict[str, Any] = {}
+        for name in _SHAPED_THING:
+            start, end = shape_ends(a, b, name)
+            # The sum may leave its ends by a rounding.
+            shapes[name] = min(max(start + t * (end - start), min(start, end)), max(start, end))
+        return replace(_combine(a, b, 1.0 - t, t), **shapes)
 
     @staticmethod
     def mix(a: Weather, b: Weather) -> Weather:
-        """Both at once: rates and extinctions add, the stronger wind blows."""
+        """Both at once: rates and extinctions add, the stronger wind blows with its gusts.
+
+        Snow wetness is the mean weighted by snow rate; fog patchiness and puffs by extinction.
+        """
+        # Of two equally strong winds the order must not decide.
+        windier = max(a, b, key=lambda w: (_speed(w), w.wind_m_per_s, w.gustiness))
         return replace(
             _combine(a, b, 1.0, 1.0),
             wetness=1 - (1 - a.wetness) * (1 - b.wetness),
             snow_cover=1 - (1 - a.snow_cover) * (1 - b.snow_cover),
             overcast=max(a.overcast, b.overcast),
-            # Of two equally strong winds the order must not decide.
-            wind_m_per_s=max(a.wind_m_per_s, b.wind_m_per_s, key=lambda w: (math.hypot(*w), w)),
+            wind_m_per_s=windier.wind_m_per_s,
+            gustiness=windier.gustiness,
+            **{name: _mixed_shape(a, b, name) for name in _SHAPED_THING},
         )
 
     @property
@@ -188,8 +216,9 @@ class Weather:
 
     @property
     def is_clear(self) -> bool:
-        """Whether nothing of this weather can be seen (wind alone cannot)."""
-        return replace(self, wind_m_per_s=(0.0, 0.0, 0.0), fog_scale_height_m=math.inf) == Weather()
+        """Whether nothing of this weather can be seen (wind, or a shape without its thing)."""
+        seen = (f for f in fields(self) if f.name not in _UNSEEN_ALONE)
+        return all(getattr(self, f.name) == f.default for f in seen)
 
     def to_dict(self) -> dict[str, Any]:
         """Fields as JSON values; infinity is None."""
@@ -198,7 +227,7 @@ class Weather:
 
     @classmethod
     def from_dict(cls, state: dict[str, Any]) -> Weather:
-        """The inverse of `to_dict`; unknown fields are refused."""
+        """The inverse of `to_dict`; missing fields have defaults, unknown ones are refused."""
         if not isinstance(state, dict):
             raise ArgumentError(f"a Weather is read from an object, got {type(state).__name__}")
         values = {
@@ -234,7 +263,20 @@ _RANGES = {
     "wetness": (0.0, 1.0),
     "snow_cover": (0.0, 1.0),
     "overcast": (0.0, 1.0),
+    "gustiness": (0.0, 1.0),
+    "snow_wetness": (0.0, 1.0),
+    "fog_patchiness": (0.0, 1.0),
+    "fog_puffs": (0.0, 0.5),
+    "spray_per_km": (0.0, 200.0),
 }
+_STRONGEST_WIND_M_PER_S = 60.0
+_SHAPED_THING = {
+    "snow_wetness": "snow_mm_per_h",
+    "fog_patchiness": "fog_per_m",
+    "fog_puffs": "fog_per_m",
+}
+"""Fields that only shape something else, and what says how much of that there is."""
+_UNSEEN_ALONE = {"wind_m_per_s", "gustiness", "fog_scale_height_m", *_SHAPED_THING}
 
 
 @dataclass(frozen=True)
@@ -267,11 +309,14 @@ _RAIN_MIST = _Stops((0.2, 0.6, 2.0, 5.0))
 _WETNESS = _Stops((0.5, 0.8, 1.0, 1.0))
 _RAIN_OVERCAST = _Stops((0.6, 0.8, 1.0, 1.0))
 _RAIN_WIND = _Stops((1.5, 3.0, 6.0, 10.0))
+_RAIN_GUSTINESS = _Stops((0.3, 0.3, 0.3, 0.3))
+_RAIN_SPRAY = _Stops((0.5, 2.0, 10.0, 25.0))
 _SNOW = _Stops((0.4, 1.0, 2.0, 4.0))
 _BLOWING_SNOW = _Stops((0.3, 0.8, 2.0, 5.0))
 _SNOW_COVER = _Stops((0.25, 0.6, 0.9, 1.0))
 _SNOW_OVERCAST = _Stops((0.6, 0.8, 1.0, 1.0))
 _SNOW_WIND = _Stops((0.5, 1.0, 2.0, 4.0))
+_SNOW_GUSTINESS = _Stops((0.25, 0.25, 0.25, 0.25))
 _FOG = _Stops((0.005, 0.01, 0.02, 0.06), power_below=1)
 _FOG_OVERCAST = _Stops((0.6, 0.8, 1.0, 1.0))
 _FOG_WIND = _Stops((0.5, 0.5, 0.5, 0.5))
@@ -300,6 +345,32 @@ def visibility_from_severity(s: float) -> float:
     """Meteorological optical range in metres of a fog severity in [0, 1]."""
     beta_per_m = _FOG.at(s)
     return -math.log(CONTRAST_THRESHOLD) / beta_per_m if beta_per_m else math.inf
+
+
+def along_left_up(name: str, vector: Wind, most: float = math.inf) -> Wind:
+    """Return `vector` as three finite floats in [-most, most], or refuse it by `name`."""
+    try:
+        along, left, up = vector
+    except (TypeError, ValueError):
+        raise ArgumentError(f"{name} must be three numbers (along, left, up)") from None
+    return (
+        finite(name, along, -most, most),
+        finite(name, left, -most, most),
+        finite(name, up, -most, most),
+    )
+
+
+def shape_ends(a: Weather, b: Weather, name: str) -> tuple[float, float]:
+    """Values just after `a` and just before `b` of a field that shapes their snow or fog.
+
+    Between the two, `Weather.blend` runs linearly. Where only one side has what the field shapes,
+    its value stands at both ends.
+    """
+    start, end = getattr(a, name), getattr(b, name)
+    has_a, has_b = (getattr(w, _SHAPED_THING[name]) > 0 for w in (a, b))
+    if has_a == has_b:
+        return start, end
+    return (start, start) if has_a else (end, end)
 
 
 def parse_severity(severity: float | str) -> float:
@@ -343,6 +414,21 @@ def _build(cls: type[Weather], state: dict[str, Any], overrides: dict[str, Any])
     return cls(**(state | overrides))
 
 
+def _speed(weather: Weather) -> float:
+    return math.hypot(*weather.wind_m_per_s)
+
+
+def _mixed_shape(a: Weather, b: Weather, name: str) -> float:
+    """Mean of a shaping field, weighted by how much of its thing there is; the larger if none."""
+    values = [getattr(w, name) for w in (a, b)]
+    amounts = [getattr(w, _SHAPED_THING[name]) for w in (a, b)]
+    total = sum(amounts)
+    if not total:
+        return max(values)
+    mean = sum(value * (amount / total) for value, amount in zip(values, amounts, strict=True))
+    return min(max(mean, min(values)), max(values))
+
+
 def _combine(a: Weather, b: Weather, share_a: float, share_b: float) -> Weather:
     """Add the two states field by field, each times its share; fog adds as extinction.
 
@@ -355,7 +441,7 @@ def _combine(a: Weather, b: Weather, share_a: float, share_b: float) -> Weather:
         if high < math.inf
     }
     state["wind_m_per_s"] = tuple(
-        min(max(share_a * x + share_b * y, -60.0), 60.0)
+        min(max(share_a * x + share_b * y, -_STRONGEST_WIND_M_PER_S), _STRONGEST_WIND_M_PER_S)
         for x, y in zip(a.wind_m_per_s, b.wind_m_per_s, strict=True)
     )
     fog_a, fog_b = share_a / a.visibility_m, share_b / b.visibility_m

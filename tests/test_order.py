@@ -23,7 +23,7 @@ STAGES = (
     "view",
     "writers",
 )
-LEAVES = ("weather", "taxonomy", "colour", "errors")
+LEAVES = ("weather", "air", "timeline", "taxonomy", "colour", "errors")
 FREE = ("cli", "doctor")
 """They stand outside the flow and may know everybody."""
 

@@ -32,6 +32,9 @@ class Optics(NamedTuple):
     up_y: np.float32
     up_z: np.float32
     area_px: np.float32
+    limit_x: np.float32 = np.float32(np.inf)
+    """Largest tangent of a ray at which a splat's shape is computed."""
+    limit_y: np.float32 = np.float32(np.inf)
 
 
 class Medium(NamedTuple):

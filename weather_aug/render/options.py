@@ -1,0 +1,67 @@
+"""What may be chosen about a render besides the weather."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from weather_aug._checks import finite
+from weather_aug.errors import ArgumentError, printable
+from weather_aug.particles.field import MAX_PARTICLES
+
+Alignment = Literal["world", "camera"]
+FallSpeed = Literal["brandes", "atlas"]
+Preset = Literal["physical", "weatheredit", "weatheredit-nuscenes"]
+Ablation = Literal["none", "attributes", "dynamics", "alignment"]
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """How a frame is rendered; the default is what the physics says, at a bounded cost.
+
+    Raises:
+        ArgumentError: If a value is none of those listed.
+    """
+
+    max_particles: int = 20_000
+    """Expected number of resolved particles in a whole picture; the rest becomes extinction."""
+    alignment: Alignment = "world"
+    """"camera" carries the particles along with the clip's first camera, as the paper's equations
+    do: they then fall as if the car were parked, while their streaks still tell of its motion."""
+    rain_fall_speed: FallSpeed = "brandes"
+    """Law of the drops' speed: Brandes et al. (2002) or Atlas et al. (1973)."""
+    multiple_scattering: bool = False
+    """Blur what lies behind thick air, as light that is scattered forward does."""
+    preset: Preset = "physical"
+    """"weatheredit" draws the particles of WeatherEdit's release instead, with its settings for
+    Waymo and PandaSet ("weatheredit-nuscenes": for nuScenes), blended in sRGB and without a
+    medium, to compare with. They know no severity."""
+    ablation: Ablation = "none"
+    """What of that release is left out; only with its presets."""
+
+    def __post_init__(self) -> None:
+        count = finite("max_particles", self.max_particles, 0, MAX_PARTICLES // 2)
+        if count != int(count):
+            raise ArgumentError(f"max_particles must be whole, got {self.max_particles!r}")
+        object.__setattr__(self, "max_particles", int(count))
+        for name, allowed in _ALLOWED.items():
+            value = getattr(self, name)
+            if value not in allowed:
+                known = ", ".join(repr(choice) for choice in allowed)
+                raise ArgumentError(f"{name} must be one of {known}, got {printable(value)!r}")
+        if self.ablation != "none" and self.preset == "physical":
+            raise ArgumentError(
+                f"ablation={self.ablation!r} leaves out a part of WeatherEdit's release; give "
+                "preset='weatheredit' too"
+            )
+
+
+_ALLOWED = {
+    "alignment": get_args(Alignment),
+    "rain_fall_speed": get_args(FallSpeed),
+    "multiple_scattering": (False, True),
+    "preset": get_args(Preset),
+    "ablation": get_args(Ablation),
+}
+
+DEFAULT_OPTIONS = RenderOptions()

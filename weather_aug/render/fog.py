@@ -114,7 +114,7 @@ def fog_volume(
     node_px = max(LEAST_NODE_PX, max(camera.width, camera.height) / NODES_ACROSS)
     rows, columns = _nodes(window, node_px)
     view = _view(camera, rows, columns, node_px, scale_height_m, axes_world, drift_world_m)
-    increments = np.zeros((NEAR_SLICES, len(rows), len(columns)))
+    increments = np.zeros((len(rows), len(columns), NEAR_SLICES))
     even_share = np.ones(len(_steps()[1]))
     if puff_share > 0:
         classes = _puff_classes(fog_per_m, puff_share, scale_height_m)

@@ -40,25 +40,28 @@ def _eased(t):
 
 
 @inlined
-def noise_at(points, lowest, x, y, z):
-    """Standard normal noise at lattice coordinates (x, y, z) inside the box `points`.
+def noise_at(points, lowest, strides, x, y, z):
+    """Standard normal noise at lattice coordinates (x, y, z) inside a box of lattice points.
 
     Args:
-        points: (X, Y, Z) float32 numbers of the lattice points.
-        lowest: (3,) int64 index of the first of them.
+        points: (X * Y * Z,) float32 numbers of the lattice points.
+        lowest: Three float32, index of the first of them.
+        strides: Two uint64, Y * Z and Z.
         x: float32, in lattice steps; as `y` and `z`.
         y: See `x`.
         z: See `x`.
     """
     one = np.float32(1.0)
     fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
-    i, j, k = np.int64(fx) - lowest[0], np.int64(fy) - lowest[1], np.int64(fz) - lowest[2]
     u, v, w = _eased(x - fx), _eased(y - fy), _eased(z - fz)
-    near, far = points[i], points[i + 1]
-    a = near[j, k] + w * (near[j, k + 1] - near[j, k])
-    b = near[j + 1, k] + w * (near[j + 1, k + 1] - near[j + 1, k])
-    c = far[j, k] + w * (far[j, k + 1] - far[j, k])
-    d = far[j + 1, k] + w * (far[j + 1, k + 1] - far[j + 1, k])
+    # Unsigned, because a signed index would be checked for wrapping around.
+    i, j = np.uint64(np.int64(fx - lowest[0])), np.uint64(np.int64(fy - lowest[1]))
+    near = i * strides[0] + j * strides[1] + np.uint64(np.int64(fz - lowest[2]))
+    far, up, right = near + strides[0], strides[1], np.uint64(1)
+    a = points[near] + w * (points[near + right] - points[near])
+    b = points[near + up] + w * (points[near + up + right] - points[near + up])
+    c = points[far] + w * (points[far + right] - points[far])
+    d = points[far + up] + w * (points[far + up + right] - points[far + up])
     a, c = a + v * (b - a), c + v * (d - c)
     variance = (u * u + (one - u) * (one - u)) * (v * v + (one - v) * (one - v))
     variance = variance * (w * w + (one - w) * (one - w))
@@ -70,7 +73,7 @@ def add_octave(points, lowest, rest, turn, ray_x, ray_y, depth_m, amplitude, noi
     """Add one octave at the samples of every ray.
 
     Args:
-        points: (X, Y, Z) float32; see `noise_at`.
+        points: (X, Y, Z) float32; see `lattice`.
         lowest: (3,) int64, counted from the lattice cell that holds the camera.
         rest: (3,) float32 place of the camera in its cell.
         turn: (3, 3) float32 lattice steps per metre of camera axes.
@@ -80,6 +83,9 @@ def add_octave(points, lowest, rest, turn, ray_x, ray_y, depth_m, amplitude, noi
         amplitude: (J,) float32 of this octave; once 0, then 0 for all farther samples.
         noise: (J, R, C) float32, added to.
     """
+    flat = points.reshape(-1)
+    strides = (np.uint64(points.shape[1] * points.shape[2]), np.uint64(points.shape[2]))
+    first = (np.float32(lowest[0]), np.float32(lowest[1]), np.float32(lowest[2]))
     for j in range(depth_m.shape[0]):
         z, scale = depth_m[j], amplitude[j]
         if scale <= np.float32(0.0):
@@ -91,8 +97,9 @@ def add_octave(points, lowest, rest, turn, ray_x, ray_y, depth_m, amplitude, noi
             for c in range(ray_x.shape[0]):
                 across = z * ray_x[c]
                 noise[j, r, c] += scale * noise_at(
-                    points,
-                    lowest,
+                    flat,
+                    first,
+                    strides,
                     x0 + turn[0, 0] * across,
                     y0 + turn[1, 0] * across,
                     z0 + turn[2, 0] * across,
@@ -111,7 +118,7 @@ def add_patches(noise, half_variance, even_share, kappa, slice_of, ends_m, per_h
         slice_of: (J,) int64.
         ends_m: (J + 1,) depths between the steps.
         per_height: (R, C) rise of the rays per metre of depth over the scale height, 1/m.
-        out: (NEAR_SLICES, R, C) float64, added to; see `froxels.accumulate`.
+        out: (R, C, NEAR_SLICES) float64, added to; see `froxels.accumulate`.
     """
     steps, rows, columns = noise.shape
     kappa32 = np.float32(kappa)
@@ -123,5 +130,5 @@ def add_patches(noise, half_variance, even_share, kappa, slice_of, ends_m, per_h
             for c in range(columns):
                 even = even_layer(end_m, per_height[r, c])
                 gain = survival(mean - kappa32 * noise[j, r, c])
-                out[k, r, c] += share * (even - before[r, c]) * gain
+                out[r, c, k] += share * (even - before[r, c]) * gain
                 before[r, c] = even

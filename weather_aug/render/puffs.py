@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from weather_aug._compiled import compiled
+from weather_aug._compiled import compiled, inlined
 from weather_aug.particles.kernels import GOLDEN, cell_key, mix64
 from weather_aug.render.medium import survival
 
@@ -118,12 +118,6 @@ def _tangents(across, ahead, reach):
 
 
 @compiled
-def _first_node(tangents, value):
-    """Index of the first of ascending `tangents` that is not below `value`."""
-    return np.searchsorted(tangents, value)
-
-
-@compiled
 def add_puffs(puffs, sigma_m, optical_depth_m, ray_x, ray_y, depths_m, rise, out):
     """Add the line integrals of puffs to the slices of every ray that they touch.
 
@@ -135,10 +129,10 @@ def add_puffs(puffs, sigma_m, optical_depth_m, ray_x, ray_y, depths_m, rise, out
         ray_y: (R,) float64 ascending tangents of the rows.
         depths_m: (NEAR_SLICES + 1,) of the slices, from 0.
         rise: (RISE,) float64 integral of the normal density from -CUT to CUT, 0 to 1.
-        out: (NEAR_SLICES, R, C) float64, added to; see `froxels.accumulate`.
+        out: (R, C, NEAR_SLICES) float64, added to; see `froxels.accumulate`.
     """
-    near = depths_m.shape[0] - 1
-    farthest = depths_m[near]
+    farthest = depths_m[depths_m.shape[0] - 1]
+    # What is cut off the sides is made good.
     whole = 1.0 / (1.0 - math.exp(-0.5 * CUT * CUT))
     for n in range(puffs.shape[0]):
         px, py, pz = puffs[n, 0], puffs[n, 1], puffs[n, 2]
@@ -148,44 +142,45 @@ def add_puffs(puffs, sigma_m, optical_depth_m, ray_x, ray_y, depths_m, rise, out
         c0, c1 = np.searchsorted(ray_x, x0), np.searchsorted(ray_x, x1)
         r0, r1 = np.searchsorted(ray_y, y0), np.searchsorted(ray_y, y1)
         away = px * px + py * py + pz * pz
+        cut2, per_variance = CUT * CUT * sigma * sigma, 0.5 / (sigma * sigma)
+        peak = optical_depth_m[n] * whole
         for r in range(r0, r1):
+            across, along_y = 1.0 + ray_y[r] * ray_y[r], ray_y[r] * py + pz
             for c in range(c0, c1):
-                squared = 1.0 + ray_x[c] * ray_x[c] + ray_y[r] * ray_y[r]
-                along = ray_x[c] * px + ray_y[r] * py + pz
+                squared = across + ray_x[c] * ray_x[c]
+                along = ray_x[c] * px + along_y
                 middle = along / squared
-                off_axis = (away - along * middle) / (sigma * sigma)
-                norm = math.sqrt(squared)
-                half = CUT * sigma / norm
-                if off_axis >= CUT * CUT or middle <= -half or middle - half >= farthest:
+                off_axis = away - along * middle
+                if off_axis >= cut2:
                     continue
-                fades = np.float64(survival(np.float32(0.5 * off_axis)))
-                amount = optical_depth_m[n] * whole * fades / norm
-                _add_profile(amount, middle, half, depths_m, rise, out[:, r, c])
+                per_norm = 1.0 / math.sqrt(squared)
+                half = CUT * sigma * per_norm
+                if middle <= -half or middle - half >= farthest:
+                    continue
+                fades = np.float64(survival(np.float32(off_axis * per_variance)))
+                _add_profile(peak * fades * per_norm, middle, half, depths_m, rise, out[r, c])
 
 
 @compiled
 def _add_profile(amount, middle, half, depths_m, rise, out):
     """Spread one puff over the slices of one ray."""
-    near = depths_m.shape[0] - 1
-    first = max(middle - half, 0.0)
-    k = int(math.sqrt(16.0 + 8.0 * first) - 4.0)
-    before = _risen(-middle / half, rise)
-    while k < near:
-        now = _risen((depths_m[k + 1] - middle) / half, rise)
+    last = depths_m.shape[0] - 1
+    start, end, per_half = middle - half, middle + half, 1.0 / half
+    k = int(math.sqrt(16.0 + 8.0 * start) - 4.0) if start > 0.0 else 0
+    before = 0.0 if start >= 0.0 else _risen(-middle * per_half, rise)
+    while k < last:
+        z = depths_m[k + 1]
+        now = 1.0 if z >= end else _risen((z - middle) * per_half, rise)
         out[k] += amount * (now - before)
-        if depths_m[k + 1] >= middle + half:
+        if z >= end:
             break
         before = now
         k += 1
 
 
-@compiled
+@inlined
 def _risen(place, rise):
     """Share of a puff in front of `place`, in units of its reach from the middle."""
-    if place <= -1.0:
-        return 0.0
-    if place >= 1.0:
-        return 1.0
     position = (place + 1.0) * (0.5 * (rise.shape[0] - 1))
-    i = min(int(position), rise.shape[0] - 2)
-    return rise[i] + (position - i) * (rise[i + 1] - rise[i])
+    i = np.uint64(min(max(np.int64(position), 0), rise.shape[0] - 2))
+    return rise[i] + (position - np.float64(i)) * (rise[i + np.uint64(1)] - rise[i])

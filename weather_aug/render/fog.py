@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import lru_cache
+from itertools import pairwise
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -18,7 +19,6 @@ from weather_aug.render import patches, puffs
 from weather_aug.render.froxels import (
     NEAR_SLICES,
     SLICES,
-    Z_FAR_M,
     FogVolume,
     accumulate,
     slice_depths_m,
@@ -148,7 +148,8 @@ def _view(
     drift_world_m: Float64,
 ) -> _View:
     (fx, fy), (cx, cy) = camera.focal_px, camera.principal_px
-    ray_x, ray_y = (columns * node_px - cx) / fx, (rows * node_px - cy) / fy
+    ray_x: Float64 = (columns * node_px - cx) / fx
+    ray_y: Float64 = (rows * node_px - cy) / fy
     axes_from_camera = np.asarray(axes_world) @ camera.world_from_camera[:3, :3]
     up = axes_from_camera[2]
     rise = up[0] * ray_x + up[1] * ray_y[:, None] + up[2]
@@ -161,7 +162,7 @@ def _steps() -> tuple[Float64, NDArray[np.int64], Float64]:
     """Ends (J + 1,), slices (J,) and middles (J,) of the steps of the integration, metres."""
     depths_m = slice_depths_m()[: NEAR_SLICES + 1]
     ends, slices = [0.0], []
-    for k, (start, end) in enumerate(zip(depths_m[:-1], depths_m[1:], strict=True)):
+    for k, (start, end) in enumerate(pairwise(depths_m)):
         count = int(np.ceil((end - start) / STEP_M))
         ends += list(start + (end - start) * np.arange(1, count + 1) / count)
         slices += [k] * count
@@ -328,9 +329,7 @@ def _puffs(view: _View, classes: _PuffClasses, seed: int) -> Float64:
     sigma_m = classes.sigma_m
     cell_m = 4.0 * sigma_m
     bounds_m = np.empty((len(sigma_m), 2, 3))
-    for k, (reach_m, pad_m) in enumerate(
-        zip(classes.reach_m, puffs.CUT * sigma_m, strict=True)
-    ):
+    for k, (reach_m, pad_m) in enumerate(zip(classes.reach_m, puffs.CUT * sigma_m, strict=True)):
         corners = np.array(list(_corners(view, reach_m))) @ view.axes_from_camera.T
         bounds_m[k] = corners.min(axis=0) - pad_m, corners.max(axis=0) + pad_m
     keys = np.array([key_of("fog-puffs", seed, k) % 2**64 for k in range(len(sigma_m))], np.uint64)

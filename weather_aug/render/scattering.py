@@ -69,11 +69,16 @@ def scattered_background(image: UInt8, optical_depth: Float32, focal_px: float) 
     like_image("optical_depth", optical_depth, image.shape[:2])
     if optical_depth.dtype != np.float32:
         raise ArgumentError(f"optical_depth must be float32, got {optical_depth.dtype}")
-    most_tau = float(optical_depth.max())
+    focal_px = finite("focal_px", focal_px, 1e-3, 1e6)
     out = image.copy()
-    if not most_tau > CLEAR_TAU:
+    thick = optical_depth > CLEAR_TAU
+    if not thick.any():
         return out
-    widest_px = _sigma_px(finite("focal_px", focal_px, 1e-3, 1e6), math.inf)
+    most_tau = float(optical_depth[thick].max())
+    part = _surroundings(thick, scattering_margin_px(focal_px, most_tau))
+    # Copies, because the kernels would be compiled once more for arrays with gaps.
+    mixed, tau = np.array(image[part], order="C"), np.array(optical_depth[part], order="C")
+    stack = _blurs(mixed, tau, focal_px, most_tau)
     law = _Law(
         np.float32(CLEAR_TAU),
         np.float32(WIDEST_TAU),
@@ -81,17 +86,34 @@ def scattered_background(image: UInt8, optical_depth: Float32, focal_px: float) 
         np.float32(MOST_WEIGHT),
         np.float32(1.0 / math.sqrt(WIDEST_TAU - CLEAR_TAU)),
     )
+    levels = np.array(LEVELS, np.float32)
+    _mix(tau, stack, levels, law, _srgb_of_16(), mixed)
+    out[part] = mixed
+    return out
+
+
+def _surroundings(mask: NDArray[np.bool_], margin: int) -> tuple[slice, slice]:
+    """Box around the set pixels and what they look at."""
+    slices = []
+    for axis in (1, 0):
+        hit = np.flatnonzero(mask.any(axis=axis))
+        slices.append(slice(max(int(hit[0]) - margin, 0), int(hit[-1]) + margin + 1))
+    return slices[0], slices[1]
+
+
+def _blurs(image: UInt8, optical_depth: Float32, focal_px: float, most_tau: float) -> UInt16:
+    """(LEVELS, H, W, 4) light times share, and share; levels wider than needed stay empty."""
     sharp = np.empty((*image.shape[:2], 4), np.uint16)
     _weigh(image, optical_depth, _linear_16(), np.float32(CLEAR_TAU), sharp)
-    stack = np.zeros((len(LEVELS), *sharp.shape), np.uint16)
+    stack = np.empty((len(LEVELS), *sharp.shape), np.uint16)
     stack[0] = sharp
+    widest_px = _sigma_px(focal_px, math.inf)
     for level in range(1, 1 + _level_above(_sigma_px(focal_px, most_tau) / widest_px)):
         sigma_px = LEVELS[level] * widest_px
         side = 2 * _radius_px(sigma_px) + 1
+        # On 16-bit integers OpenCV computes in fixed point: no bit depends on a pixel's place.
         cv2.GaussianBlur(sharp, (side, side), sigma_px, dst=stack[level])
-    levels = np.array(LEVELS, np.float32)
-    _mix(optical_depth, stack, levels, law, _srgb_of_16(), out)
-    return out
+    return stack
 
 
 def scattering_margin_px(focal_px: float, most_tau: float) -> int:
@@ -147,9 +169,7 @@ def _weigh(image: UInt8, tau: Float32, linear: Float32, full_tau: np.float32, ou
 
 
 @compiled
-def _mix(
-    tau: Float32, stack: UInt16, levels: Float32, law: _Law, srgb: UInt8, out: UInt8
-) -> None:
+def _mix(tau: Float32, stack: UInt16, levels: Float32, law: _Law, srgb: UInt8, out: UInt8) -> None:
     """Mix each pixel with the two blurs of the stack that enclose its own."""
     white, half = np.float32(65535.0), np.float32(0.5)
     for y in range(tau.shape[0]):

@@ -118,7 +118,7 @@ def fog_volume(
     even_share = np.ones(len(_steps()[1]))
     if puff_share > 0:
         classes = _puff_classes(fog_per_m, puff_share, scale_height_m)
-        even_share -= puff_share * _faded(_steps()[2], classes.reach_m).mean(axis=0)
+        even_share -= puff_share * _drawn(_steps()[2], classes.reach_m[:, None]).mean(axis=0)
         _add_puffs(view, classes, seed, scale_height_m, increments)
     _add_patches(view, kappa, even_share, seed, increments)
     share = np.empty((SLICES, len(rows), len(columns)), np.float32)
@@ -148,8 +148,8 @@ def _view(
     drift_world_m: Float64,
 ) -> _View:
     (fx, fy), (cx, cy) = camera.focal_px, camera.principal_px
-    ray_x: Float64 = (columns * node_px - cx) / fx
-    ray_y: Float64 = (rows * node_px - cy) / fy
+    ray_x: Float64 = (columns.astype(np.float64) * node_px - cx) / fx
+    ray_y: Float64 = (rows.astype(np.float64) * node_px - cy) / fy
     axes_from_camera = np.asarray(axes_world) @ camera.world_from_camera[:3, :3]
     up = axes_from_camera[2]
     rise = up[0] * ray_x + up[1] * ray_y[:, None] + up[2]
@@ -290,10 +290,10 @@ def _puff_classes(fog_per_m: float, puff_share: float, scale_height_m: float) ->
     return _PuffClasses(sigma_m, density, reach_m, np.full(len(sigma_m), tau / fog_per_m))
 
 
-def _faded(depth_m: Float64, reach_m: Float64) -> Float64:
-    """(K, J) share of the puffs of each class that is drawn at each depth (J,)."""
-    start = PUFF_FADE * reach_m[:, None]
-    return 1.0 - _smooth((depth_m - start) / (reach_m[:, None] - start))
+def _drawn(depth_m: Float64, reach_m: Float64) -> Float64:
+    """Share of the puffs at a depth that is drawn; even fog carries the rest."""
+    start_m = PUFF_FADE * reach_m
+    return 1.0 - _smooth((depth_m - start_m) / (reach_m - start_m))
 
 
 def _add_puffs(
@@ -303,19 +303,17 @@ def _add_puffs(
     found = _puffs(view, classes, seed)
     index = found[:, 3].astype(np.int64)
     sigma_m, reach_m = classes.sigma_m[index], classes.reach_m[index]
-    start = PUFF_FADE * reach_m
-    fade = 1.0 - _smooth((found[:, 2] - start) / (reach_m - start))
+    drawn = _drawn(found[:, 2], reach_m)
     # A Gaussian in exponential air: the mean over all puffs at a height is the air's own density
     # there only if each is thinned by the second term, too.
     thinning = found[:, 4] / scale_height_m + 0.5 * (sigma_m / scale_height_m) ** 2
-    alive = (fade > 0) & (found[:, 2] > -puffs.CUT * sigma_m) & (thinning > -8.0)
-    optical_depth_m = (classes.optical_depth_m[index] * fade * np.exp(-np.maximum(thinning, -8.0)))[
-        alive
-    ]
+    # Below eight scale heights the even fog thickens no more, either.
+    alive = (drawn > 0) & (found[:, 2] > -puffs.CUT * sigma_m) & (thinning > -8.0)
+    index, thinning, drawn = index[alive], thinning[alive], drawn[alive]
     puffs.add_puffs(
         found[alive],
-        sigma_m[alive],
-        optical_depth_m,
+        classes.sigma_m[index],
+        classes.optical_depth_m[index] * drawn * np.exp(-thinning),
         view.ray_x,
         view.ray_y,
         slice_depths_m()[: NEAR_SLICES + 1],

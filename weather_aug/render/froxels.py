@@ -5,7 +5,7 @@ A froxel node belongs to a ray of the whole picture (a point of a coarse grid th
 that depth over the optical depth of even fog to the same depth. A pixel looks G up at its own depth
 and multiplies its own, exact optical depth by it: nothing bleeds over depth edges. Between two
 depths G is linear in 1 / depth, that is, the fog of a slice is spread evenly over it, so that the
-optical depth never falls with depth.
+optical depth never falls with depth (where fog thins with height, to 0.001).
 
 Compiled; per-pixel numbers are float32.
 """
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from weather_aug._compiled import compiled
 
 NEAR_SLICES = 32
-FAR_SLICES = 6
+FAR_SLICES = 12
 SLICES = 1 + NEAR_SLICES + FAR_SLICES
 """One at the camera, those up to `Z_FAR_M` ever wider, those beyond even in 1 / depth."""
 Z_FAR_M = NEAR_SLICES + NEAR_SLICES**2 / 8

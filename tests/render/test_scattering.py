@@ -6,7 +6,6 @@ from oracles.reference_render import linear, srgb
 from scipy.ndimage import gaussian_filter
 
 from weather_aug.errors import ArgumentError
-from weather_aug.render import scattering
 from weather_aug.render.scattering import scattered_background, scattering_margin_px
 
 FOCAL_PX = 700.0
@@ -108,4 +107,3 @@ def test_bad_arguments_are_named(picture):
         scattered_background(picture, np.zeros(picture.shape[:2]), FOCAL_PX)
     with pytest.raises(ArgumentError, match="focal_px"):
         scattered_background(picture, depths_like(picture, 1.0), 0.0)
-    assert scattering.MOST_WEIGHT == 0.35

@@ -45,7 +45,7 @@ PUFF_SIGMAS_M = (1.0, 1.6, 2.5, 4.0)
 REACH_SIGMAS = 30.0
 PUFF_FADE = 0.7
 """Puffs fade between this share of their reach and all of it; even fog takes over."""
-DEEPEST_TAU = 5.0
+DEEPEST_TAU = 4.0
 """Nobody sees a puff behind so much fog."""
 PUFF_OPTICAL_DEPTH = (0.01, 0.05)
 """Range of a puff's optical depth through its middle."""

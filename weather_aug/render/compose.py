@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,47 +10,25 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from weather_aug._checks import finite
 from weather_aug._keys import check_seed
+from weather_aug.air import Air, air_of
 from weather_aug.clip.types import Camera, Frame, FrameKey
-from weather_aug.colour import LUMINANCE
-from weather_aug.edit.physical.overcast import ZENITH_GAIN, tone
 from weather_aug.errors import ArgumentError
-from weather_aug.particles import statistics
-from weather_aug.particles.field import MAX_PARTICLES, ParticleField, Window
-from weather_aug.particles.resolve import DEPTH_BINS, FAR_M, Resolved
+from weather_aug.particles.field import Window
+from weather_aug.particles.shelter import Shelter
 from weather_aug.render import planes
-from weather_aug.render.label import NEIGHBOURHOOD_PX, least_linear_contrast, readable_labels
-from weather_aug.render.light import Ambience, rain_colour, snow_colour
-from weather_aug.render.medium import Medium, Optics
-from weather_aug.render.project import BAND_ROWS, project, sorted_in_blocks, split_by_band
-from weather_aug.render.shade import Tone, shade
+from weather_aug.render.fields import RigMotion, fields_of
+from weather_aug.render.label import NEIGHBOURHOOD_PX, readable_labels
+from weather_aug.render.light import Ambience
+from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
+from weather_aug.render.scattering import scattering_margin_px
+from weather_aug.render.stage import Planes, Stage
 from weather_aug.taxonomy import SKY
-from weather_aug.weather import Weather, Wind
+from weather_aug.weather import Weather
 
 Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 
-_EVEN = np.empty((0, 0), np.float32)
-"""No patches in the fog."""
-
-
-@dataclass(frozen=True)
-class RenderOptions:
-    """How much work to spend on a frame."""
-
-    max_particles: int = 20_000
-    """Expected number of resolved particles in a whole picture; the rest becomes extinction."""
-
-    def __post_init__(self) -> None:
-        count = finite("max_particles", self.max_particles, 0, MAX_PARTICLES // 2)
-        if count != int(count):
-            raise ArgumentError(f"max_particles must be whole, got {self.max_particles!r}")
-        object.__setattr__(self, "max_particles", int(count))
-
-
-DEFAULT_OPTIONS = RenderOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +56,9 @@ def render(
     seed: int,
     ambience: Ambience,
     window: Window | None = None,
-    drift_m: Wind | None = None,
+    air: Air | None = None,
+    shelter: Shelter | None = None,
+    rig: RigMotion | None = None,
     options: RenderOptions = DEFAULT_OPTIONS,
 ) -> RenderedFrame:
     """Render `frame` in `weather`: a pure function of its arguments.
@@ -85,21 +66,24 @@ def render(
     Args:
         frame: Picture with depth; a label decides where the sky is, else the depth does.
         weather: State of air and ground.
-        seed: Which particles fall. At equal drift a higher rain rate adds drops to those already
-            there; of snow small flakes become fewer and large ones more.
+        seed: Which particles fall and which gusts blow. In equal air a higher rain rate adds drops
+            to those already there; of snow small flakes become fewer and large ones more.
         ambience: Light and axes of the scene.
         window: (top, left, height, width) to render, the whole picture if None; a window's pixels
             equal the same pixels of the whole.
-        drift_m: How far the wind has carried the air since time 0 (along the street, to its left,
-            up); wind times time if None. Give it to compare weathers of different wind, or where
-            the wind changed on the way.
-        options: Budget.
+        air: How the air moves and has moved; if None, as it does when the weather has been the same
+            since time 0. `WeatherTimeline.air` tells it of changing weather, `Air.held` keeps
+            drops in place from one weather to the next.
+        shelter: Bridges and roofs of the street, None for an open sky.
+        rig: Motion of the reference camera, for options that carry the particles along with it; if
+            None, this camera stood at time 0 where it stands.
+        options: Choices besides the weather.
 
     Raises:
         ArgumentError: If the frame has no depth or the window leaves the picture.
 
     Source:
-        docs/design.md, master equation: I = T B + (1 - T) A behind particles that are themselves
+        docs/physics.md, master equation: I = T B + (1 - T) A behind particles that are themselves
         seen through the air in front of them, all in linear light.
     """
     seed = check_seed("seed", seed)
@@ -113,15 +97,20 @@ def render(
     window = checked_window(window, height, width)
     if weather.is_clear:
         return _clear(frame, window)
-    # Labels look around themselves, and so does the sky where only depth tells of it.
-    looks = 1 if frame.label is not None else 2
-    outer = _with_margin(window, looks * (NEIGHBOURHOOD_PX // 2), height, width)
+    if air is None:
+        air = air_of(weather, frame.time_s, seed)
+    outer = _with_margin(window, _margin_px(frame, options), height, width)
     image, label, depth = _cut(frame, outer)
     sky = _sky_by_depth(depth) if label is None else label == SKY
-    fields = _fields(weather, seed, ambience, drift_m)
-    budget = options.max_particles // max(len(fields), 1)
-    resolved = [field.resolve(frame.camera, budget) for field in fields]
-    shot = _shade(frame, weather, ambience, outer, fields, resolved, image, depth, sky)
+    stage = Stage(
+        image, depth, sky, outer, frame.camera, weather, ambience, seed, air, options
+    )
+    if options.preset == "physical":
+        fields = fields_of(weather, seed, air, ambience.axes_world, options, rig)
+        shot = stage.shaded(fields, shelter, frame.time_s)
+    else:
+        here = frame.camera.world_from_camera
+        shot = stage.published(rig or RigMotion(here, here), frame.time_s)
     return _trimmed(shot, label, depth, outer, window)
 
 
@@ -156,9 +145,12 @@ def warm_up() -> None:
     depth = np.full((16, 16), 20.0)
     label = np.zeros((16, 16), np.uint8)
     storm = Weather.mix(Weather.rain("heavy"), Weather.snow("heavy"))
+    roof = Shelter(np.full((8, 8), 3.0, np.float32), np.array([-2.0, -2.0, -5.0]), axes)
+    patchy = Weather(visibility_m=50.0, fog_patchiness=0.5, fog_puffs=0.2)
     for dtype in (np.float16, np.float32):
         frame = Frame(FrameKey(0, "warm-up"), 0.0, camera, image, label, depth.astype(dtype))
-        render(frame, storm, seed=0, ambience=ambience)
+        render(frame, storm, seed=0, ambience=ambience, shelter=roof)
+        render(frame, patchy, seed=0, ambience=ambience)
 
 
 def _clear(frame: Frame, window: Window) -> RenderedFrame:
@@ -221,134 +213,20 @@ def _with_margin(window: Window, margin: int, height: int, width: int) -> Window
     return (first, start, end - first, stop - start)
 
 
-def _fields(
-    weather: Weather, seed: int, ambience: Ambience, drift_m: Wind | None = None
-) -> list[ParticleField]:
-    axes = ambience.axes_world
-    wind = np.asarray(weather.wind_m_per_s) @ axes
-    drift = None if drift_m is None else np.asarray(drift_m, np.float64) @ axes
-    populations = []
-    if weather.rain_mm_per_h > statistics.TRACE_MM_PER_H:
-        populations.append(statistics.rain(weather.rain_mm_per_h))
-    if weather.snow_mm_per_h > statistics.TRACE_MM_PER_H:
-        populations.append(statistics.snow(weather.snow_mm_per_h))
-    return [ParticleField(population, seed, wind, axes, drift) for population in populations]
+def _margin_px(frame: Frame, options: RenderOptions) -> int:
+    """How far around a pixel its label and colour depend on the picture.
 
-
-def _optics(camera: Camera, up_world: Float64) -> Optics:
-    up = camera.world_from_camera[:3, :3].T @ up_world
-    values = (
-        *camera.focal_px,
-        *camera.principal_px,
-        camera.exposure_s,
-        camera.aperture_m,
-        *camera.angular_velocity_rad_per_s,
-        *up,
-        camera.width * camera.height,
-    )
-    return Optics(*(np.float32(v) for v in values))
-
-
-def _medium(weather: Weather, fields: list[ParticleField]) -> Medium:
-    values = (
-        weather.fog_per_m,
-        1.0 / weather.fog_scale_height_m,
-        weather.mist_per_km * 1e-3,
-        sum(field.population.extinction_per_m for field in fields),
-        FAR_M / DEPTH_BINS,
-        0.0,
-    )
-    return Medium(*(np.float32(v) for v in values))
-
-
-def _shade(
-    frame: Frame,
-    weather: Weather,
-    ambience: Ambience,
-    window: Window,
-    fields: list[ParticleField],
-    resolved: list[Resolved],
-    image: UInt8,
-    depth: Float32,
-    sky: NDArray[np.bool_],
-) -> dict[str, Any]:
-    """Run the kernels over a window; planes of its size come back."""
-    optics = _optics(frame.camera, ambience.axes_world[2])
-    medium = _medium(weather, fields)
-    carried = np.zeros(DEPTH_BINS + 1, np.float32)
-    for part in resolved:
-        carried = carried + part.optical_depth
-    airlight = ambience.airlight.astype(np.float32)
-    splats = _splats(frame, weather, ambience, window, fields, resolved, optics, medium, carried)
-    _, _, height, width = window
-    bands = -(-height // BAND_ROWS)
-    splats, band_starts = split_by_band(splats, window, bands)
-    curve, matrix = tone(weather.overcast)
-    out: dict[str, Any] = {
-        "image": np.empty((3, height, width), np.uint8),
-        "transmittance": np.empty((height, width), np.float32),
-        "distinct": np.empty((height, width), np.uint8),
-        "covered": np.zeros((height, width), np.uint8),
-    }
-    shade(
-        image,
-        depth,
-        sky,
-        _EVEN,
-        window,
-        optics,
-        medium,
-        carried,
-        curve.astype(np.float32),
-        matrix.astype(np.float32),
-        Tone(
-            np.float32(weather.overcast),
-            np.float32(max(float(ambience.sky @ LUMINANCE), 0.05)),
-            np.float32(ZENITH_GAIN),
-            np.float32(0.0),
-        ),
-        airlight,
-        splats,
-        band_starts,
-        np.float32(least_linear_contrast(ambience.airlight)),
-        *out.values(),
-    )
-    out["image"] = cv2.merge(tuple(out["image"]))
-    return out
-
-
-def _splats(
-    frame: Frame,
-    weather: Weather,
-    ambience: Ambience,
-    window: Window,
-    fields: list[ParticleField],
-    resolved: list[Resolved],
-    optics: Optics,
-    medium: Medium,
-    carried: Float32,
-) -> Float32:
-    """(N, 16) screen-space particles of all fields that touch the window."""
-    light = ambience.under(weather.overcast)
-    colour_of = {"rain": rain_colour, "snow": snow_colour}
-    clouds = [
-        field.particles(frame.camera, frame.time_s, part, window)
-        for field, part in zip(fields, resolved, strict=True)
-    ]
-    if not any(len(cloud) for cloud in clouds):
-        return np.empty((0, 16), np.float32)
-    particles = np.concatenate(clouds) if len(clouds) > 1 else clouds[0]
-    colours = np.array([colour_of[f.population.kind](light) for f in fields], np.float32)
-    blocks, kinds = sorted_in_blocks(particles, np.cumsum([len(cloud) for cloud in clouds]))
-    airlight = ambience.airlight.astype(np.float32)
-    splats: Float32 = project(
-        blocks, kinds, colours, optics, medium, carried, airlight, window, True
-    )
-    return splats
+    Labels look around themselves, and so does the sky where only depth tells of it.
+    """
+    looks = 1 if frame.label is not None else 2
+    margin = looks * (NEIGHBOURHOOD_PX // 2)
+    if options.multiple_scattering:
+        margin += scattering_margin_px(max(frame.camera.focal_px), math.inf)
+    return margin
 
 
 def _trimmed(
-    shot: dict[str, Any],
+    shot: Planes,
     label: UInt8 | None,
     depth: Float32,
     outer: Window,
@@ -359,14 +237,14 @@ def _trimmed(
     part = (slice(top, top + window[2]), slice(left, left + window[3]))
     seen = np.zeros(depth.shape, np.uint8) if label is None else label
     honest, invalid = readable_labels(
-        seen, shot["transmittance"], shot["distinct"], shot["covered"]
+        seen, shot.transmittance, shot.distinct, shot.covered
     )
     cut = np.ascontiguousarray
     return RenderedFrame(
-        image=cut(shot["image"][part]),
+        image=cut(shot.image[part]),
         label=None if label is None else cut(honest[part]),
         label_full=None if label is None else label[part].copy(),
         invalid=cut(invalid[part]),
-        transmittance=cut(shot["transmittance"][part]),
+        transmittance=cut(shot.transmittance[part]),
         depth=cut(depth[part]),
     )

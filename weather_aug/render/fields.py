@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug.air import Air
-from weather_aug.clip.types import Camera, Frame
+from weather_aug.clip.types import Camera
 from weather_aug.particles import statistics
 from weather_aug.particles.field import ParticleField, Window
 from weather_aug.particles.published import PublishedField
@@ -71,7 +71,8 @@ def fields_of(
 
 
 def splats_of(
-    frame: Frame,
+    camera: Camera,
+    time_s: float,
     fields: Sequence[ParticleField],
     resolved: Sequence[Resolved],
     light: Ambience,
@@ -84,7 +85,8 @@ def splats_of(
     """Splats (M, 16) of all fields that touch the window, far to near.
 
     Args:
-        frame: Camera and time.
+        camera: Of the whole picture.
+        time_s: Seconds since the clip's start.
         fields: Of one moment.
         resolved: What the camera resolves of each.
         light: Under the weather's sky.
@@ -96,9 +98,9 @@ def splats_of(
     """
     clouds = [
         exposed(
-            field.particles(frame.camera, frame.time_s, part, window),
-            frame.camera,
-            np.asarray(field.air.wind_m_per_s) @ field.axes_world,
+            field.particles(camera, time_s, part, window),
+            camera,
+            field.air.wind_m_per_s,
             shelter,
         )
         for field, part in zip(fields, resolved, strict=True)
@@ -118,7 +120,8 @@ def published_kinds(weather: Weather) -> list[str]:
 
 
 def published_splats(
-    frame: Frame,
+    camera: Camera,
+    time_s: float,
     weather: Weather,
     seed: int,
     axes_world: Float64,
@@ -141,9 +144,9 @@ def published_splats(
         )
         for kind in published_kinds(weather)
     ]
-    clouds = [field.particles(frame.camera, frame.time_s, window) for field in fields]
+    clouds = [field.particles(camera, time_s, window) for field in fields]
     greys = [np.full(3, field.grey_srgb) for field in fields]
-    still, clear = still_optics(optics, frame.camera), Medium(*(np.float32(0.0),) * 6)
+    still, clear = still_optics(optics, camera), Medium(*(np.float32(0.0),) * 6)
     clear = clear._replace(resolved_step_m=np.float32(1.0))
     nothing = np.zeros(2, np.float32)
     return _projected(clouds, greys, still, clear, nothing, np.zeros(3), window, False)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from weather_aug._compiled import compiled, inlined
+from weather_aug.render.froxels import share_row
 
 FAR_DEPTH_M = 60000.0
 """float16 ends here; a greater depth is the sky or beyond measure."""
@@ -122,26 +123,46 @@ def near_optical_depth(z, ray_x, ray_y, optics, medium, carried):
 
 
 @compiled
-def transmittance_row(
-    depth, fog_share, ray_x, ray_y, optics, medium, resolved_depth, tau, slant, out
-):
-    """`path_optical_depth` and `survival` of one row, in loops that the compiler can vectorise.
+def reach_row(depth, ray_x, ray_y, optics, slant, reach):
+    """Length of a ray per metre of depth, and the depth at which each pixel's air ends."""
+    one = np.float32(1.0)
+    far, nearly_flat = np.float32(FAR_DEPTH_M), np.float32(0.05)
+    layer_m, longest_m = np.float32(1000.0), np.float32(20000.0)
+    across = one + ray_y * ray_y
+    rise_y = optics.up_y * ray_y + optics.up_z
+    deepest = np.float32(0.0)
+    for x in range(depth.shape[0]):
+        slant[x] = np.sqrt(across + ray_x[x] * ray_x[x])
+        reach[x] = depth[x]
+    for x in range(depth.shape[0]):
+        deepest = max(deepest, depth[x])
+    if deepest < far:
+        return
+    for x in range(depth.shape[0]):
+        sine = (optics.up_x * ray_x[x] + rise_y) / slant[x]
+        sine = sine if sine > nearly_flat else nearly_flat
+        beyond_m = layer_m / sine
+        beyond_m = beyond_m if beyond_m < longest_m else longest_m
+        reach[x] = depth[x] if depth[x] < far else beyond_m / slant[x]
+
+
+@compiled
+def transmittance_row(ray_x, ray_y, slant, share, optics, medium, resolved_depth, tau, out):
+    """Optical depth of the air before each pixel of a row and what of the light survives it.
 
     Args:
-        depth: (W,) metres, `inf` for far.
-        fog_share: (W,) factor on the fog's optical depth, or (0,) for 1.
         ray_x: (W,) tangents.
         ray_y: Tangent.
+        slant: (W,) length of a ray per metre of depth.
+        share: (W,) factor on the fog's optical depth, or (0,) for 1.
         optics: Camera.
         medium: Air.
         resolved_depth: Optical depth of resolved particles by depth.
         tau: (W,) out: optical depth.
-        slant: (W,) scratch.
-        out: (W,) out: transmittance.
+        out: (W,) depth at which the air ends in, transmittance out.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
-    width = depth.shape[0]
-    _reach_row(depth, ray_x, ray_y, optics, slant, out)
+    width = out.shape[0]
     for x in range(width):
         tau[x] = medium.fog_per_m * out[x] * slant[x]
     rise_y = optics.up_y * ray_y + optics.up_z
@@ -149,9 +170,9 @@ def transmittance_row(
         for x in range(width):
             rise = optics.up_x * ray_x[x] + rise_y
             tau[x] *= layer_share(out[x] * rise * medium.inverse_height_per_m)
-    if fog_share.shape[0] > 0:
+    if share.shape[0] > 0:
         for x in range(width):
-            tau[x] *= fog_share[x]
+            tau[x] *= share[x]
     for x in range(width):
         tau[x] += medium.haze_per_m * out[x] * slant[x]
     if medium.spray_per_m > zero:
@@ -173,25 +194,25 @@ def transmittance_row(
         out[x] = survival(tau[x])
 
 
-@inlined
-def _reach_row(depth, ray_x, ray_y, optics, slant, reach):
-    """Length of a ray per metre of depth, and the depth at which each pixel's air ends."""
-    one = np.float32(1.0)
-    far, nearly_flat = np.float32(FAR_DEPTH_M), np.float32(0.05)
-    layer_m, longest_m = np.float32(1000.0), np.float32(20000.0)
-    across = one + ray_y * ray_y
-    rise_y = optics.up_y * ray_y + optics.up_z
-    deepest = np.float32(0.0)
-    for x in range(depth.shape[0]):
-        slant[x] = np.sqrt(across + ray_x[x] * ray_x[x])
-        reach[x] = depth[x]
-    for x in range(depth.shape[0]):
-        deepest = max(deepest, depth[x])
-    if deepest < far:
-        return
-    for x in range(depth.shape[0]):
-        sine = (optics.up_x * ray_x[x] + rise_y) / slant[x]
-        sine = sine if sine > nearly_flat else nearly_flat
-        beyond_m = layer_m / sine
-        beyond_m = beyond_m if beyond_m < longest_m else longest_m
-        reach[x] = depth[x] if depth[x] < far else beyond_m / slant[x]
+@compiled
+def optical_depth(depth, window, optics, medium, resolved_depth, patches):
+    """Optical depth (H, W) float32 of the air in front of each pixel of a window."""
+    top, left, height, width = window
+    ray_x = np.empty(width, np.float32)
+    for x in range(width):
+        ray_x[x] = (np.float32(x + left) - optics.cx) / optics.fx
+    patchy = patches.share.shape[0] > 0
+    nodes = np.empty(patches.share.shape[0] * patches.share.shape[2], np.float32)
+    place = np.empty(width if patchy else 0, np.uint32)
+    share = np.empty(width if patchy else 0, np.float32)
+    slant, reach = np.empty(width, np.float32), np.empty(width, np.float32)
+    tau = np.empty((height, width), np.float32)
+    for y in range(height):
+        ray_y = (np.float32(y + top) - optics.cy) / optics.fy
+        reach_row(depth[y], ray_x, ray_y, optics, slant, reach)
+        if patchy:
+            share_row(patches, y + top, left, reach, nodes, place, share)
+        transmittance_row(
+            ray_x, ray_y, slant, share, optics, medium, resolved_depth, tau[y], reach
+        )
+    return tau

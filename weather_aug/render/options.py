@@ -55,6 +55,11 @@ class RenderOptions:
                 "preset='weatheredit' too"
             )
 
+    @property
+    def needs_rig(self) -> bool:
+        """Whether the particles depend on where the rig has been."""
+        return self.preset != "physical" or self.alignment == "camera"
+
 
 _ALLOWED = {
     "alignment": get_args(Alignment),

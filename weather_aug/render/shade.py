@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from weather_aug._compiled import compiled
-from weather_aug.render.medium import transmittance_row
+from weather_aug.render.froxels import share_row
+from weather_aug.render.medium import reach_row, transmittance_row
 from weather_aug.render.project import BAND_ROWS
 from weather_aug.render.tile import TILE_FLOATS, blend_band, cover_splat
 
@@ -30,7 +31,7 @@ def shade(
     image,
     depth,
     sky,
-    fog_share,
+    patches,
     window,
     optics,
     medium,
@@ -53,7 +54,7 @@ def shade(
         image: (H, W, 3) uint8 of the window.
         depth: (H, W) float32 z-depth of the window, `inf` for far.
         sky: (H, W) bool of the window.
-        fog_share: (H, W) float32, optical depth of the fog over that of even fog; (0, 0) if even.
+        patches: FogVolume, of no slices where the fog is even.
         window: (top, left, height, width) in the whole picture.
         optics: Camera of the whole picture.
         medium: Air.
@@ -81,8 +82,10 @@ def shade(
     stride = (width + 15) // 16 * 16 + 80
     planes = np.zeros((BAND_ROWS, 5, stride), np.float32)
     tiles = np.empty((BAND_ROWS // 4, stride // 4, TILE_FLOATS), np.float32)
-    even = np.empty(0, np.float32)
-    patchy = fog_share.shape[0] > 0
+    patchy = patches.share.shape[0] > 0
+    nodes = np.empty(patches.share.shape[0] * patches.share.shape[2], np.float32)
+    place = np.empty(width if patchy else 0, np.uint32)
+    share = np.empty(width if patchy else 0, np.float32)
     gap = np.empty((BAND_ROWS, width), np.float32)
     tau = np.empty(width, np.float32)
     slant = np.empty(width, np.float32)
@@ -96,9 +99,11 @@ def shade(
             red, green, blue = planes[k, 0, :width], planes[k, 1, :width], planes[k, 2, :width]
             clear = planes[k, 3, :width]
             planes[k, 4, :width] = depth[y]
-            share = fog_share[y] if patchy else even
+            reach_row(depth[y], ray_x, ray_y, optics, slant, clear)
+            if patchy:
+                share_row(patches, y + top, left, clear, nodes, place, share)
             transmittance_row(
-                depth[y], share, ray_x, ray_y, optics, medium, resolved_depth, tau, slant, clear
+                ray_x, ray_y, slant, share, optics, medium, resolved_depth, tau, clear
             )
             _decode_row(image[y], linear, red, green, blue)
             if overcast:

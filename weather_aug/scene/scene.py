@@ -128,33 +128,48 @@ class WeatherScene:
     def render(
         self,
         key: FrameKey,
-        weather: Weather,
+        weather: Weather | WeatherTimeline,
         *,
         seed: int = 0,
         window: Window | None = None,
-        drift_m: Wind | None = None,
+        air: Air | None = None,
         options: RenderOptions = DEFAULT_OPTIONS,
     ) -> RenderedFrame:
         """Render one frame in a weather; see `weather_aug.render.compose.render`.
 
         Args:
             key: Which frame, one of `keys`.
-            weather: State of air and ground.
+            weather: State of air and ground, or how it changes with the time since the first frame.
             seed: Which particles fall.
             window: (top, left, height, width); the whole picture if None.
-            drift_m: How far the wind has carried the air since the clip's start (along the street,
-                to its left, up); wind times time if None.
-            options: Budget.
+            air: How the air moves and has moved since the clip's start; if None, as the weather
+                tells.
+            options: Choices besides the weather.
         """
+        frame = self.frame(key)
+        frame = replace(frame, time_s=frame.time_s - self.manifest.frames[0].time_s)
+        if isinstance(weather, WeatherTimeline):
+            air = air or weather.air(frame.time_s, seed)
+            weather = weather.at(frame.time_s)
         return render(
-            self.frame(key),
+            frame,
             weather,
             seed=seed,
             ambience=self.ambience(key),
             window=window,
-            drift_m=drift_m,
+            air=air,
+            shelter=self.shelter,
+            rig=self._rig_motion(frame.key) if options.needs_rig else None,
             options=options,
         )
+
+    def _rig_motion(self, key: FrameKey) -> RigMotion:
+        """Of the clip's first camera up to the moment of a frame, or to the last one before it."""
+        first = self.manifest.frames[0]
+        seen = [r for r in self.manifest.frames if r.key.camera == first.key.camera]
+        before = [r for r in seen if r.key.time_index <= key.time_index]
+        now = before[-1] if before else seen[0]
+        return RigMotion(first.camera.world_from_camera, now.camera.world_from_camera)
 
     def damaged_files(self) -> list[str]:
         """Compare every file with its digest; one sentence for each that has changed."""

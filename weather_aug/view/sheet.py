@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from weather_aug import _files
 from weather_aug._checks import finite
 from weather_aug._png import png_bytes
+from weather_aug.air import Air
 from weather_aug.clip.types import FrameKey
 from weather_aug.errors import ArgumentError
 from weather_aug.render.compose import RenderedFrame
@@ -157,7 +158,7 @@ def write_png(path: Path, image: UInt8) -> None:
 
 def _shot(scene: WeatherScene, key: FrameKey, weather: Weather, seed: int) -> RenderedFrame:
     """One picture of a sheet; the air has drifted alike in all, so that drops stay."""
-    return scene.render(key, weather, seed=seed, drift_m=(0.0, 0.0, 0.0))
+    return scene.render(key, weather, seed=seed, air=Air.held(weather))
 
 
 def _label(shot: RenderedFrame) -> UInt8:

@@ -1,0 +1,208 @@
+"""One window of a picture and all that is known about it, on its way through the kernels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from weather_aug.air import Air
+from weather_aug.clip.types import Camera
+from weather_aug.colour import LUMINANCE
+from weather_aug.edit.physical.overcast import ZENITH_GAIN, tone
+from weather_aug.particles.field import ParticleField, Window
+from weather_aug.particles.resolve import DEPTH_BINS, FAR_M
+from weather_aug.particles.shelter import Shelter
+from weather_aug.render.fields import RigMotion, published_splats, splats_of
+from weather_aug.render.fog import fog_volume
+from weather_aug.render.froxels import FogVolume, even_fog
+from weather_aug.render.label import least_linear_contrast
+from weather_aug.render.light import Ambience
+from weather_aug.render.medium import SPRAY_HEIGHT_M, Medium, Optics, optical_depth
+from weather_aug.render.options import RenderOptions
+from weather_aug.render.project import BAND_ROWS, split_by_band
+from weather_aug.render.scattering import scattered_background
+from weather_aug.render.shade import Tone, shade
+from weather_aug.weather import Weather
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+
+
+class Planes(NamedTuple):
+    """What the kernels write about each pixel of a window."""
+
+    image: UInt8
+    """(H, W, 3) sRGB."""
+    transmittance: Float32
+    """(H, W) of air and particles."""
+    distinct: UInt8
+    """(H, W), 1 where what is left of the surface can be told from the airlight."""
+    covered: UInt8
+    """(H, W), 1 where a large particle hides the surface."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """A window of a picture, its camera, its weather and its light."""
+
+    image: UInt8
+    """(H, W, 3) sRGB of the window."""
+    depth: Float32
+    """(H, W) metres, `inf` for far."""
+    sky: NDArray[np.bool_]
+    """(H, W) where the sky may show."""
+    window: Window
+    camera: Camera
+    """Of the whole picture."""
+    weather: Weather
+    ambience: Ambience
+    seed: int
+    air: Air
+    options: RenderOptions
+
+    def shaded(
+        self, fields: Sequence[ParticleField], shelter: Shelter | None, time_s: float
+    ) -> Planes:
+        """The window with the weather's sky, medium and particles."""
+        options, weather = self.options, self.weather
+        budget = options.max_particles // max(len(fields), 1)
+        resolved = [field.resolve(self.camera, budget) for field in fields]
+        carried = np.zeros(DEPTH_BINS + 1, np.float32)
+        for part in resolved:
+            carried = carried + part.optical_depth
+        optics = optics_of(self.camera, self.ambience.axes_world[2])
+        medium = medium_of(weather, fields, self.ambience)
+        patches = self._patches()
+        image = self.image
+        if options.multiple_scattering:
+            tau = optical_depth(self.depth, self.window, optics, medium, carried, patches)
+            image = scattered_background(image, tau, max(self.camera.focal_px))
+        light = self.ambience.under(weather.overcast)
+        splats = splats_of(
+            self.camera, time_s, fields, resolved, light, optics, medium, carried, self.window,
+            shelter,
+        )
+        curve, matrix = tone(weather.overcast)
+        sky_luminance = max(float(self.ambience.sky @ LUMINANCE), 0.05)
+        look = (weather.overcast, sky_luminance, ZENITH_GAIN, 0.0)
+        return self._run(image, patches, optics, medium, carried, curve, matrix, look, splats)
+
+    def published(self, rig: RigMotion, time_s: float) -> Planes:
+        """The window with the weather's sky and the particles of WeatherEdit's release.
+
+        First the background, then the particles over it, blended as they are stored: in sRGB.
+        """
+        optics = optics_of(self.camera, self.ambience.axes_world[2])
+        nothing = np.zeros(DEPTH_BINS + 1, np.float32)
+        clear = medium_of(Weather(), (), self.ambience)
+        curve, matrix = tone(self.weather.overcast)
+        sky_luminance = max(float(self.ambience.sky @ LUMINANCE), 0.05)
+        look = (self.weather.overcast, sky_luminance, ZENITH_GAIN, 0.0)
+        none = np.empty((0, 16), np.float32)
+        still = even_fog()
+        background = self._run(
+            self.image, still, optics, clear, nothing, curve, matrix, look, none
+        )
+        splats = published_splats(
+            self.camera, time_s, self.weather, self.seed, self.ambience.axes_world, self.options,
+            rig, optics, self.window,
+        )
+        levels = np.arange(256) / 255.0
+        plain = (0.0, sky_luminance, ZENITH_GAIN, 1.0)
+        return self._run(
+            background.image, still, optics, clear, nothing, levels, np.eye(3), plain, splats
+        )
+
+    def _patches(self) -> FogVolume:
+        weather, axes = self.weather, self.ambience.axes_world
+        volume = fog_volume(
+            self.camera,
+            self.window,
+            fog_per_m=weather.fog_per_m,
+            scale_height_m=weather.fog_scale_height_m,
+            patchiness=weather.fog_patchiness,
+            puff_share=weather.fog_puffs,
+            seed=self.seed,
+            axes_world=axes,
+            drift_world_m=np.asarray(self.air.drift_m) @ axes,
+        )
+        return even_fog() if volume is None else volume
+
+    def _run(
+        self,
+        image: UInt8,
+        patches: FogVolume,
+        optics: Optics,
+        medium: Medium,
+        carried: Float32,
+        curve: Float64,
+        matrix: Float64,
+        look: tuple[float, float, float, float],
+        splats: Float32,
+    ) -> Planes:
+        """Allocate what the kernel writes, and run it."""
+        _, _, height, width = self.window
+        splats, band_starts = split_by_band(splats, self.window, -(-height // BAND_ROWS))
+        levels = np.empty((3, height, width), np.uint8)
+        through = np.empty((height, width), np.float32)
+        distinct = np.empty((height, width), np.uint8)
+        covered = np.zeros((height, width), np.uint8)
+        shade(
+            image,
+            self.depth,
+            self.sky,
+            patches,
+            self.window,
+            optics,
+            medium,
+            carried,
+            curve.astype(np.float32),
+            matrix.astype(np.float32),
+            Tone(*(np.float32(v) for v in look)),
+            self.ambience.airlight.astype(np.float32),
+            splats,
+            band_starts,
+            np.float32(least_linear_contrast(self.ambience.airlight)),
+            levels,
+            through,
+            distinct,
+            covered,
+        )
+        merged: UInt8 = cv2.merge(tuple(levels))
+        return Planes(merged, through, distinct, covered)
+
+
+def optics_of(camera: Camera, up_world: Float64) -> Optics:
+    """What the kernels know of a camera."""
+    up = camera.world_from_camera[:3, :3].T @ up_world
+    values = (
+        *camera.focal_px,
+        *camera.principal_px,
+        camera.exposure_s,
+        camera.aperture_m,
+        *camera.angular_velocity_rad_per_s,
+        *up,
+        camera.width * camera.height,
+    )
+    return Optics(*(np.float32(v) for v in values))
+
+
+def medium_of(weather: Weather, fields: Sequence[ParticleField], ambience: Ambience) -> Medium:
+    """What the kernels know of the air."""
+    at_camera = math.exp(-ambience.camera_height_m / SPRAY_HEIGHT_M)
+    values = (
+        weather.fog_per_m,
+        1.0 / weather.fog_scale_height_m,
+        weather.mist_per_km * 1e-3,
+        sum(field.population.extinction_per_m for field in fields),
+        FAR_M / DEPTH_BINS,
+        weather.spray_per_km * 1e-3 * at_camera,
+    )
+    return Medium(*(np.float32(v) for v in values))

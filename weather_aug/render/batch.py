@@ -320,9 +320,9 @@ def _check_drawable(
     """Refuse what would be left out, because a silent difference from `render` is worse."""
     if not isinstance(options, RenderOptions):
         raise ArgumentError(f"options must be RenderOptions, got {type(options).__name__}")
-    for field in fields(RenderOptions):
-        asked = getattr(options, field.name)
-        if field.name != "max_particles" and asked != getattr(DEFAULT_OPTIONS, field.name):
+    for field in fields(options):
+        drawn = field.name == "max_particles"
+        if not drawn and getattr(options, field.name) != getattr(DEFAULT_OPTIONS, field.name, None):
             raise ArgumentError(f"options.{field.name} is not supported in a batch; use render")
     for weather in weathers:
         for name in NOT_DRAWN:

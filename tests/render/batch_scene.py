@@ -51,9 +51,10 @@ class Case:
         return render(self.frame, self.weather, seed=self.seed, ambience=AMBIENCE)
 
 
-def street(motion="parked", *, width=160, height=96, labelled=True, time_s=1.0):
+def street(motion="parked", *, width=160, height=96, labelled=True, time_s=1.0, **optics):
     """Road, facades and sky with texture, and their depth."""
-    camera = make_camera(width, height, exposure_s=0.004, **MOTIONS[motion])
+    optics = {"exposure_s": 0.004} | MOTIONS[motion] | optics
+    camera = make_camera(width, height, **optics)
     v, u = np.mgrid[:height, :width].astype(np.float32)
     x = (u - (width - 1) / 2) / camera.focal_px[0]
     y = (v - (height - 1) / 2) / camera.focal_px[1]

@@ -44,6 +44,16 @@ def test_agrees_with_the_compiled_renderer(motion, labelled):
             assert shots.label is None
 
 
+def test_large_flakes_hide_the_same_surfaces():
+    """A long lens and a short exposure: flakes of many pixels, sharp and opaque."""
+    frame = street(exposure_s=0.0003, aperture_m=0.0, focal_px=500.0)
+    case = Case(frame, Weather(snow_mm_per_h=4.0), seed=9)
+    expected, found = case.alone(), batch([case])
+    assert (expected.label != frame.label).sum() > 100
+    assert (found.label[0].numpy() != expected.label).mean() <= 1e-3
+    assert (found.invalid[0].numpy() != expected.invalid).mean() <= 1e-3
+
+
 def without_compensation(monkeypatch):
     wrong = partial(batch_project.project, compensate=False)
     monkeypatch.setattr(batch_module, "project", wrong)

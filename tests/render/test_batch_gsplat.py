@@ -1,6 +1,7 @@
 """What surrounds gsplat: its arguments, and the scene's depth, which it does not know."""
 
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,8 +9,9 @@ import pytest
 import torch
 from batch_scene import WEATHERS, Case, arguments, street
 
+from weather_aug.errors import MissingExtraError
 from weather_aug.render import batch as batch_module
-from weather_aug.render import batch_gsplat
+from weather_aug.render import batch_gsplat, batch_splat
 from weather_aug.render.batch import render_batch
 from weather_aug.render.batch_gsplat import splat_in_slabs, surfaces_under
 from weather_aug.render.batch_splat import empty_layer, splat
@@ -107,6 +109,15 @@ def test_slabs_agree_with_exact_order(scene):
     assert one >= light
 
 
+def test_large_splats_cover_as_in_exact_order(scene, monkeypatch):
+    splats, depth = scene
+    monkeypatch.setattr(batch_splat, "HIDING_ALPHA", 0.2)
+    splats = replace(splats, large=splats.half.amax(dim=1) > 3)
+    exact = splat(splats, depth)
+    assert exact.covered.any()
+    assert torch.equal(exact.covered, splat_in_slabs(splats, depth, torch_twin, 4).covered)
+
+
 def test_most_splats_go_to_the_rasteriser(scene):
     splats, depth = scene
     sent = []
@@ -137,6 +148,15 @@ def test_gsplat_gets_what_it_expects(scene, monkeypatch):
     torch.testing.assert_close(through, expected_through, atol=0.01, rtol=0)
     torch.testing.assert_close(light, expected_light, atol=0.01, rtol=0)
     assert (through - expected_through).abs().mean() < 1e-4
+
+
+def test_gsplat_without_its_cuda_code_is_named(scene, monkeypatch):
+    """As gsplat 1.5.3 ends where it could not compile itself."""
+    splats, _ = scene
+    broken = SimpleNamespace(isect_tiles=lambda *_: None.intersect_tile)
+    monkeypatch.setitem(sys.modules, "gsplat", broken)
+    with pytest.raises(MissingExtraError, match="CUDA code"):
+        batch_gsplat.rasterise(splats, 96, 160)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")

@@ -71,6 +71,8 @@ def test_nearer_particles_cover_farther_ones():
     layer = splat(batch_project.concatenated(parts).far_to_near(), depth)
     assert layer.light[0, 48, 80] > 0.95
     assert layer.light[2, 48, 80] < 0.05
+    assert layer.covered[48, 80]
+    assert not layer.covered[0, 0]
     wall = splat(batch_project.concatenated(parts).far_to_near(), torch.full((96, 160), 4.0))
     assert (wall.light[2] == 0).all()
 

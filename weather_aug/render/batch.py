@@ -73,9 +73,11 @@ def render_batch(
     every run on a device; see `batch_gsplat` for what "gsplat" approximates.
 
     Convention:
-        Gradients flow from `image` to `images`, and nowhere else. float16 and bfloat16 are
-        computed in float32; transmittance and depth then come back in float32. Pictures are worked
-        on one after the other, so that memory beyond the result does not grow with the batch.
+        Gradients flow from `image` to `images`, and nowhere else; the tone curve is interpolated
+        between 8-bit levels, and at a level its slope is that of the interval above. float16 and
+        bfloat16 are computed in float32; transmittance and depth then come back in float32.
+        Pictures are worked on one after the other, so that memory beyond the result does not grow
+        with the batch (but for what autograd keeps).
 
     Args:
         images: (B, 3, H, W) sRGB in [0, 1], floating point, on a CPU or CUDA device.
@@ -95,7 +97,7 @@ def render_batch(
     Raises:
         ArgumentError: If an argument has another shape, range, length, dtype or device than stated,
             or asks for what only `render` draws (patchy fog, fog puffs, spray).
-        MissingExtraError: If gsplat is asked for and not installed.
+        MissingExtraError: If gsplat is asked for and it or its CUDA code is missing.
     """
     _check_tensors(images, depth_m, labels)
     per_picture = {

@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from weather_aug._extras import require
+from weather_aug.errors import MissingExtraError, printable
 from weather_aug.render.batch_project import Splats
 from weather_aug.render.batch_splat import NEAR_EDGE_M, Layer, empty_layer, splat
 
@@ -63,7 +64,7 @@ def splat_gsplat(splats: Splats, depth_m: Tensor) -> Layer:
     """`splat_in_slabs` with gsplat.
 
     Raises:
-        MissingExtraError: If gsplat is not installed.
+        MissingExtraError: If gsplat or its CUDA code is missing.
     """
     return splat_in_slabs(splats, depth_m, rasterise, SLABS)
 
@@ -72,13 +73,23 @@ def splat_gsplat(splats: Splats, depth_m: Tensor) -> Layer:
 def rasterise(splats: Splats, height: int, width: int) -> tuple[Tensor, Tensor]:
     """Draw CUDA splats with gsplat; see `Rasteriser`.
 
+    Raises:
+        MissingExtraError: If gsplat or its CUDA code is missing.
+
     Source:
         gsplat 1.5: `isect_tiles`, `isect_offset_encode`, `rasterize_to_pixels`.
     """
     gsplat = require("gsplat", extra="gsplat", to="draw particles with splatting='gsplat'")
     means, radii, conics, colours, opacities, depths = gsplat_arguments(splats)
     tiles_x, tiles_y = -(-width // TILE_PX), -(-height // TILE_PX)
-    _, crossings, flat = gsplat.isect_tiles(means, radii, depths, TILE_PX, tiles_x, tiles_y)
+    try:
+        _, crossings, flat = gsplat.isect_tiles(means, radii, depths, TILE_PX, tiles_x, tiles_y)
+    except (ImportError, AttributeError) as error:
+        # What gsplat raises where its CUDA code was neither shipped nor could be compiled.
+        raise MissingExtraError(
+            f"gsplat is installed but its CUDA code cannot be loaded ({printable(error)}); it is "
+            "compiled on first use and needs a CUDA compiler: or pass splatting='torch'"
+        ) from error
     offsets = gsplat.isect_offset_encode(crossings, 1, tiles_x, tiles_y)
     light, opacity = gsplat.rasterize_to_pixels(
         means, conics, colours, opacities, width, height, TILE_PX, offsets, flat

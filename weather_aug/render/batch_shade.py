@@ -81,8 +81,9 @@ def encoded(light: Tensor) -> Tensor:
 
 def neighbourhood(mask: Tensor) -> Tensor:
     """(H, W) bool: true where the mask is within 7 x 7 pixels."""
-    size = NEIGHBOURHOOD_PX
-    grown = functional.max_pool2d(mask.float()[None, None], size, stride=1, padding=size // 2)
+    size, rim = NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX // 2
+    grown = functional.max_pool2d(mask.float()[None, None], (1, size), stride=1, padding=(0, rim))
+    grown = functional.max_pool2d(grown, (size, 1), stride=1, padding=(rim, 0))
     return grown[0, 0] > 0.0
 
 

@@ -22,7 +22,11 @@ FOCUS_M = 6.0
 LONG_SWEEP_PX = 12.0
 WIDE_STREAK_PX = 1.0
 SWEEP_PER_PART = 3.0
-"""Sweep of a part in standard deviations of the streak's width."""
+"""Sweep of a part in standard deviations of the footprint."""
+WHOLE_SPREAD = 1.0 / 12.0
+"""Variance of a uniform sweep of length one."""
+PART_SPREAD = 0.2
+"""Of a part, which overlaps its neighbours so that their sum does not ripple."""
 MOST_PARTS = 16
 LARGE_SHARE = 1e-3
 """A footprint of more than this share of the picture can hide a surface."""
@@ -87,7 +91,7 @@ def project(
     The projected covariance gains q q^T / 12 from a uniform sweep q, c^2 / 16 from defocus of
     diameter c and 0.3 px^2 from the pixel filter; the peak falls by the square root of the ratio of
     determinants, so that the opacity integrated over the picture is the silhouette's. A sweep of
-    more than 12 px of a particle wider than a pixel is split into parts of three widths each.
+    more than 12 px of a footprint wider than a pixel is drawn in parts of three widths each.
 
     Args:
         particles: (N, 13): position in metres, velocity relative to the camera's centre in m/s,
@@ -113,14 +117,15 @@ def project(
     defocus = camera.aperture_m * fx * (1.0 / z - 1.0 / FOCUS_M)
     soft = PIXEL_FILTER_PX2 + defocus * defocus / 16.0
     whole = torch.arange(len(rows), device=rows.device)
-    parts = _part_counts(qx, qy, a0 + soft, b0, c0 + soft)
+    parts = _part_counts(torch.hypot(qx, qy), 0.5 * (a0 + c0) + soft)
     i = torch.repeat_interleave(whole, parts)
     first = torch.cumsum(parts, 0) - parts
     place = (torch.arange(len(i), device=i.device) - first[i] + 0.5) / parts[i] - 0.5
     px, py = qx[i] / parts[i], qy[i] / parts[i]
-    a = a0[i] + px * px / 12.0 + soft[i]
-    b = b0[i] + px * py / 12.0
-    c = c0[i] + py * py / 12.0 + soft[i]
+    spread = torch.where(parts == 1, WHOLE_SPREAD, PART_SPREAD)[i]
+    a = a0[i] + spread * px * px + soft[i]
+    b = b0[i] + spread * px * py
+    c = c0[i] + spread * py * py + soft[i]
     det = a * c - b * b
     det_sharp = (a0 * c0 - b0 * b0).clamp(min=0.0)[i]
     fainter = torch.sqrt(det_sharp / det) if compensate else torch.ones_like(det)
@@ -130,7 +135,7 @@ def project(
     half = torch.sqrt(reach2.clamp(min=0.0)[:, None] * torch.stack([a, c], dim=1))
     seen = (reach2 > 0.0) & _touches(u, v, half, camera)
     through = torch.exp(-air.optical_depth(z, tx, ty))[i, None]
-    area_px2 = torch.pi * reach2 * torch.sqrt(det)
+    area_px2 = torch.pi * reach2 * torch.sqrt(det) * parts[i]
     splats = Splats(
         u=u.float(),
         v=v.float(),
@@ -168,14 +173,12 @@ def _sharp_covariance(
     return sx * sx * uu, sx * sy * uv, sy * sy * vv
 
 
-def _part_counts(qx: Tensor, qy: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """How many Gaussians (N,) draw each streak; a, b, c are its covariance but for the sweep."""
-    length = torch.hypot(qx, qy)
-    across = (a * qy * qy - 2.0 * b * qx * qy + c * qx * qx).clamp(min=0.0)
-    width = torch.sqrt(across) / length.clamp(min=1e-12)
-    parts = torch.ceil(length / (SWEEP_PER_PART * width.clamp(min=WIDE_STREAK_PX)))
-    long = (length > LONG_SWEEP_PX) & (width > WIDE_STREAK_PX)
-    return torch.where(long, parts.clamp(1, MOST_PARTS), torch.ones_like(parts)).long()
+def _part_counts(sweep_px: Tensor, variance_px2: Tensor) -> Tensor:
+    """How many Gaussians (N,) draw each streak, from its length and its mean variance without."""
+    width = torch.sqrt(variance_px2)
+    parts = torch.ceil(sweep_px / (SWEEP_PER_PART * width)).clamp(1, MOST_PARTS)
+    long = (sweep_px > LONG_SWEEP_PX) & (width > WIDE_STREAK_PX)
+    return torch.where(long, parts, torch.ones_like(parts)).long()
 
 
 def _touches(u: Tensor, v: Tensor, half: Tensor, camera: Camera) -> Tensor:

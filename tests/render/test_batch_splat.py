@@ -41,11 +41,15 @@ def surfaces(camera, seed=1):
 
 @pytest.mark.parametrize("motion", [(0.0, 0, 0), (0.3, -1.0, 0.5)])
 def test_agrees_with_the_slow_reference(motion, monkeypatch):
-    monkeypatch.setattr(batch_project, "LONG_SWEEP_PX", float("inf"))
+    rows = _records_of_discs(discs(150))
+    if not hasattr(reference, "gaussians"):
+        # MERGE: drop this once the reference takes records and cuts streaks, as from 36ce008 on.
+        monkeypatch.setattr(batch_project, "LONG_SWEEP_PX", float("inf"))
+        rows = discs(150)
     camera = make_camera(angular_velocity_rad_per_s=np.array(motion))
     particles, depth = discs(150), surfaces(camera)
     light, through = np.zeros((96, 160, 3)), np.ones((96, 160))
-    scene = (particles.astype(float), camera, lambda _: np.ones(3))
+    scene = (rows.astype(float), camera, lambda _: np.ones(3))
     reference.splat(light, through, depth, *scene)
     layer = splat(projected(particles, camera), torch.from_numpy(depth))
     assert through.min() < 0.7

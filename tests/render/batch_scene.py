@@ -1,0 +1,100 @@
+"""A small street for the batch renderer's tests, as arrays, as tensors and under names."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from render_scene import make_camera, make_frame
+
+from weather_aug.clip.types import Frame
+from weather_aug.render.batch import render_batch
+from weather_aug.render.compose import render
+from weather_aug.render.light import Ambience
+from weather_aug.taxonomy import BUILDING, ROAD, SKY
+from weather_aug.weather import Weather
+
+AMBIENCE = Ambience(
+    np.eye(3),
+    sky=np.array([0.4, 0.6, 0.9]),
+    middle=np.full(3, 0.2),
+    ground=np.full(3, 0.12),
+    airlight=np.array([0.55, 0.56, 0.57]),
+)
+FOG = Weather(visibility_m=120.0, fog_scale_height_m=30.0)
+WEATHERS = {
+    "rain": Weather(rain_mm_per_h=75.0),
+    "snow": Weather.snow("extreme"),
+    "fog": replace(Weather.fog("heavy"), overcast=0.0),
+    "rain and fog": Weather.mix(FOG, Weather.rain("extreme")),
+    "rain and snow": Weather.mix(Weather.rain("heavy"), Weather.snow("heavy")),
+}
+MOTIONS = {
+    "parked": {},
+    "driving": {"velocity_m_per_s": np.array([14.0, 0.3, 0])},
+    "turning": {
+        "velocity_m_per_s": np.array([8.0, 0, 0]),
+        "angular_velocity_rad_per_s": np.array([0.1, -0.6, 0.2]),
+    },
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One picture to render both ways."""
+
+    frame: Frame
+    weather: Weather
+    seed: int = 3
+
+    def alone(self):
+        """By `render`."""
+        return render(self.frame, self.weather, seed=self.seed, ambience=AMBIENCE)
+
+
+def street(motion="parked", *, width=160, height=96, labelled=True, time_s=1.0, **optics):
+    """Road, facades and sky with texture, and their depth."""
+    optics = {"exposure_s": 0.004} | MOTIONS[motion] | optics
+    camera = make_camera(width, height, **optics)
+    v, u = np.mgrid[:height, :width].astype(np.float32)
+    x = (u - (width - 1) / 2) / camera.focal_px[0]
+    y = (v - (height - 1) / 2) / camera.focal_px[1]
+    with np.errstate(divide="ignore"):
+        road, facade = np.where(y > 0, 1.5 / y, np.inf), 4.0 / np.abs(x)
+    facade[facade * -y > 6.0] = np.inf
+    depth = np.minimum(road, facade).astype(np.float32)
+    depth[depth > 300] = np.inf
+    label = np.where(road < facade, ROAD, BUILDING).astype(np.uint8)
+    label[np.isinf(depth)] = SKY
+    image = np.random.default_rng(5).integers(20, 235, (height, width, 3)).astype(np.uint8)
+    image[label == SKY] = 200 + image[label == SKY] // 8
+    return make_frame(camera, image, depth, label if labelled else None, time_s)
+
+
+def arguments(cases, dtype=torch.float32):
+    """Of `render_batch`, for cases of one size."""
+    frames = [case.frame for case in cases]
+    images = np.stack([frame.image for frame in frames])
+    labels = None
+    if frames[0].label is not None:
+        labels = torch.from_numpy(np.stack([frame.label for frame in frames]))
+    return {
+        "images": torch.from_numpy(images).permute(0, 3, 1, 2).to(dtype) / 255,
+        "depth_m": torch.from_numpy(np.stack([frame.depth_m for frame in frames])),
+        "cameras": [frame.camera for frame in frames],
+        "weathers": [case.weather for case in cases],
+        "seeds": [case.seed for case in cases],
+        "ambiences": [AMBIENCE] * len(cases),
+        "times_s": [frame.time_s for frame in frames],
+        "labels": labels,
+        "splatting": "torch",
+    }
+
+
+def batch(cases, **overrides):
+    return render_batch(**(arguments(cases) | overrides))
+
+
+def psnr(levels, expected):
+    """Of (3, H, W) in [0, 1] against (H, W, 3) uint8, decibels."""
+    image = 255 * levels.detach().double().cpu().numpy().transpose(1, 2, 0)
+    return 10 * np.log10(255**2 / max(np.mean((image - expected) ** 2), 1e-12))

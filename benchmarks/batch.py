@@ -16,7 +16,8 @@ from benchmarks.overlays import CASES, HEIGHT, WIDTH
 from benchmarks.scene import street
 from benchmarks.timing import interleaved
 from weather_aug.render.batch import RenderedBatch, render_batch
-from weather_aug.render.compose import RenderOptions, render
+from weather_aug.render.compose import render
+from weather_aug.render.options import RenderOptions
 
 BATCH = 4
 

@@ -15,7 +15,8 @@ import numpy as np
 
 from benchmarks.scene import street
 from benchmarks.timing import interleaved
-from weather_aug.render.compose import RenderOptions, render
+from weather_aug.render.compose import render
+from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
 
 HEIGHT, WIDTH = 512, 1024

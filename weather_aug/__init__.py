@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from weather_aug.clip.types import FrameKey as FrameKey
     from weather_aug.errors import WeatherAugError as WeatherAugError
     from weather_aug.render.compose import RenderedFrame as RenderedFrame
-    from weather_aug.render.compose import RenderOptions as RenderOptions
+    from weather_aug.render.options import RenderOptions as RenderOptions
     from weather_aug.scene.policy import WeatherPolicy as WeatherPolicy
     from weather_aug.scene.scene import WeatherScene as WeatherScene
     from weather_aug.timeline import WeatherTimeline as WeatherTimeline

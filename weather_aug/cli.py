@@ -88,7 +88,7 @@ class Render:
         """Render and name the folder."""
         from tqdm.auto import tqdm
 
-        from weather_aug.render.compose import RenderOptions
+        from weather_aug.render.options import RenderOptions
         from weather_aug.scene.scene import WeatherScene
         from weather_aug.view.sheet import write_png
 

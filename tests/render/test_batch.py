@@ -15,7 +15,8 @@ from weather_aug.render import batch as batch_module
 from weather_aug.render import batch_project, batch_shade
 from weather_aug.render import project as compiled_project
 from weather_aug.render.batch import render_batch
-from weather_aug.render.compose import RenderOptions, render
+from weather_aug.render.compose import render
+from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
 
 

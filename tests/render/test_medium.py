@@ -7,8 +7,9 @@ from render_scene import make_camera, make_frame
 from scipy.integrate import quad
 
 from weather_aug.colour import SRGB_LEVELS_LINEAR
-from weather_aug.render.compose import RenderOptions, render
+from weather_aug.render.compose import render
 from weather_aug.render.medium import survival
+from weather_aug.render.options import RenderOptions
 from weather_aug.render.shade import encode_row
 from weather_aug.weather import Weather
 

@@ -11,14 +11,9 @@ from render_scene import make_camera, make_frame
 from weather_aug.errors import ArgumentError
 from weather_aug.particles.kernels import scatter, solve_reach
 from weather_aug.render import planes
-from weather_aug.render.compose import (
-    RenderOptions,
-    _clean_depth,
-    checked_window,
-    render,
-    warm_up,
-)
+from weather_aug.render.compose import _clean_depth, checked_window, render, warm_up
 from weather_aug.render.light import Ambience, airlight_from_sky, ambience_of
+from weather_aug.render.options import RenderOptions
 from weather_aug.render.project import project, sorted_in_blocks, split_by_band
 from weather_aug.render.shade import shade
 from weather_aug.scene.policy import weather_of
@@ -267,7 +262,14 @@ def test_half_precision_depth_is_widened_exactly():
 def test_warm_up_leaves_nothing_to_compile():
     """Else each worker of a fresh machine compiles for itself, all at once."""
     warm_up()
-    kernels = (shade, project, sorted_in_blocks, split_by_band, planes.widen_depth, planes.clean_depth)
+    kernels = (
+        shade,
+        project,
+        sorted_in_blocks,
+        split_by_band,
+        planes.widen_depth,
+        planes.clean_depth,
+    )
     kernels += (planes.raise_sky, planes.read_labels, scatter, solve_reach)
     before = [len(kernel.signatures) for kernel in kernels]
     frame = street_frame()

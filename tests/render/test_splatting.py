@@ -9,8 +9,9 @@ from render_scene import make_camera, make_frame
 
 from weather_aug.particles import statistics
 from weather_aug.render import compose
-from weather_aug.render.compose import RenderOptions, render
+from weather_aug.render.compose import render
 from weather_aug.render.medium import Medium
+from weather_aug.render.options import RenderOptions
 from weather_aug.render.project import BAND_ROWS, FAINTEST, log, sorted_in_blocks, split_by_band
 from weather_aug.render.project import project as project_kernel
 from weather_aug.render.shade import Tone, shade

@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader
 
 from weather_aug.clip.types import FrameKey
 from weather_aug.errors import ArgumentError
-from weather_aug.render.compose import RenderOptions
+from weather_aug.render.options import RenderOptions
 from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.transforms.dataset import WeatherDataset

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from tiny_export import POLICY, TinyClip
 
 from weather_aug.errors import ArgumentError, ConflictError, SceneError
-from weather_aug.render.compose import RenderOptions
+from weather_aug.render.options import RenderOptions
 from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.writers.plan import ExportPlan, plan_export

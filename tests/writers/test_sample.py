@@ -14,7 +14,7 @@ from tiny_export import TinyClip
 
 from weather_aug._png import png_bytes
 from weather_aug.errors import ArgumentError
-from weather_aug.render.compose import DEFAULT_OPTIONS
+from weather_aug.render.options import DEFAULT_OPTIONS
 from weather_aug.scene import store
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.view.sheet import write_png

@@ -24,10 +24,10 @@ from weather_aug.render.batch_gsplat import splat_gsplat
 from weather_aug.render.batch_medium import AirColumn, pixel_rays
 from weather_aug.render.batch_project import concatenated, project
 from weather_aug.render.batch_splat import Layer, empty_layer, splat
-from weather_aug.render.compose import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.render.label import least_linear_contrast
 from weather_aug.render.light import Ambience, rain_colour, snow_colour
 from weather_aug.render.medium import FAR_DEPTH_M
+from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.taxonomy import SKY
 from weather_aug.weather import Weather
 

@@ -30,7 +30,6 @@ Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 
 
-
 @dataclass(frozen=True, eq=False)
 class RenderedFrame:
     """A picture in weather, and what can still be said about it; H, W are the window's size."""
@@ -102,9 +101,7 @@ def render(
     outer = _with_margin(window, _margin_px(frame, options), height, width)
     image, label, depth = _cut(frame, outer)
     sky = _sky_by_depth(depth) if label is None else label == SKY
-    stage = Stage(
-        image, depth, sky, outer, frame.camera, weather, ambience, seed, air, options
-    )
+    stage = Stage(image, depth, sky, outer, frame.camera, weather, ambience, seed, air, options)
     if options.preset == "physical":
         fields = fields_of(weather, seed, air, ambience.axes_world, options, rig)
         shot = stage.shaded(fields, shelter, frame.time_s)
@@ -236,9 +233,7 @@ def _trimmed(
     top, left = window[0] - outer[0], window[1] - outer[1]
     part = (slice(top, top + window[2]), slice(left, left + window[3]))
     seen = np.zeros(depth.shape, np.uint8) if label is None else label
-    honest, invalid = readable_labels(
-        seen, shot.transmittance, shot.distinct, shot.covered
-    )
+    honest, invalid = readable_labels(seen, shot.transmittance, shot.distinct, shot.covered)
     cut = np.ascontiguousarray
     return RenderedFrame(
         image=cut(shot.image[part]),

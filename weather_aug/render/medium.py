@@ -212,7 +212,5 @@ def optical_depth(depth, window, optics, medium, resolved_depth, patches):
         reach_row(depth[y], ray_x, ray_y, optics, slant, reach)
         if patchy:
             share_row(patches, y + top, left, reach, nodes, place, share)
-        transmittance_row(
-            ray_x, ray_y, slant, share, optics, medium, resolved_depth, tau[y], reach
-        )
+        transmittance_row(ray_x, ray_y, slant, share, optics, medium, resolved_depth, tau[y], reach)
     return tau

@@ -86,7 +86,15 @@ class Stage:
             image = scattered_background(image, tau, max(self.camera.focal_px))
         light = self.ambience.under(weather.overcast)
         splats = splats_of(
-            self.camera, time_s, fields, resolved, light, optics, medium, carried, self.window,
+            self.camera,
+            time_s,
+            fields,
+            resolved,
+            light,
+            optics,
+            medium,
+            carried,
+            self.window,
             shelter,
         )
         curve, matrix = tone(weather.overcast)
@@ -107,12 +115,17 @@ class Stage:
         look = (self.weather.overcast, sky_luminance, ZENITH_GAIN, 0.0)
         none = np.empty((0, 16), np.float32)
         still = even_fog()
-        background = self._run(
-            self.image, still, optics, clear, nothing, curve, matrix, look, none
-        )
+        background = self._run(self.image, still, optics, clear, nothing, curve, matrix, look, none)
         splats = published_splats(
-            self.camera, time_s, self.weather, self.seed, self.ambience.axes_world, self.options,
-            rig, optics, self.window,
+            self.camera,
+            time_s,
+            self.weather,
+            self.seed,
+            self.ambience.axes_world,
+            self.options,
+            rig,
+            optics,
+            self.window,
         )
         levels = np.arange(256) / 255.0
         plain = (0.0, sky_luminance, ZENITH_GAIN, 1.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,12 +12,16 @@ from weather_aug.clip.types import Clip, Frame, FrameKey
 from weather_aug.errors import ArgumentError, IntegrityError, printable
 from weather_aug.particles.field import Window
 from weather_aug.particles.shelter import Shelter
-from weather_aug.render.compose import DEFAULT_OPTIONS, RenderedFrame, RenderOptions, render
+from weather_aug.render.compose import RenderedFrame, render
+from weather_aug.render.fields import RigMotion
 from weather_aug.render.light import Ambience
+from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene import store
+from weather_aug.timeline import WeatherTimeline
 
 if TYPE_CHECKING:
-    from weather_aug.weather import Weather, Wind
+    from weather_aug.air import Air
+    from weather_aug.weather import Weather
 
 
 class WeatherScene:

@@ -18,7 +18,7 @@ from weather_aug import _files
 from weather_aug._keys import check_seed, key_of, uniforms
 from weather_aug.clip.types import FrameKey
 from weather_aug.errors import ArgumentError, ConflictError, printable
-from weather_aug.render.compose import DEFAULT_OPTIONS, RenderOptions
+from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene import store
 from weather_aug.scene.policy import WeatherDraw, WeatherPolicy
 from weather_aug.scene.scene import WeatherScene

@@ -14,7 +14,8 @@ from weather_aug import _files
 from weather_aug._png import png_bytes
 from weather_aug.clip.types import FrameKey
 from weather_aug.errors import SceneError, printable
-from weather_aug.render.compose import RenderedFrame, RenderOptions
+from weather_aug.render.compose import RenderedFrame
+from weather_aug.render.options import RenderOptions
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.taxonomy import CLASSES
 from weather_aug.weather import Weather

@@ -17,7 +17,7 @@ _HOMES = {
     "Frame": "weather_aug.clip.types",
     "FrameKey": "weather_aug.clip.types",
     "open_clip": "weather_aug.clip.open",
-    "RenderOptions": "weather_aug.render.compose",
+    "RenderOptions": "weather_aug.render.options",
     "RenderedFrame": "weather_aug.render.compose",
     "WeatherScene": "weather_aug.scene.scene",
     "WeatherPolicy": "weather_aug.scene.policy",

@@ -7,18 +7,22 @@ import pytest
 from oracles import reference_render as reference
 from render_scene import make_camera, make_frame
 
+from weather_aug.air import air_of
 from weather_aug.particles import statistics
-from weather_aug.render import compose
 from weather_aug.render.compose import render
+from weather_aug.render.fields import fields_of
+from weather_aug.render.froxels import even_fog
+from weather_aug.render.light import rain_colour, snow_colour
 from weather_aug.render.medium import Medium
-from weather_aug.render.options import RenderOptions
+from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.render.project import BAND_ROWS, FAINTEST, log, sorted_in_blocks, split_by_band
 from weather_aug.render.project import project as project_kernel
 from weather_aug.render.shade import Tone, shade
+from weather_aug.render.stage import optics_of
 from weather_aug.weather import Weather
 
 UP = np.array([0.0, 0, 1])
-CLEAR_AIR = Medium(*(np.float32(v) for v in (0, 0, 0, 0, 60 / 1024, 0)))
+CLEAR_AIR = Medium(*(np.float32(v) for v in (0, 0, 0, 0, 60 / 1024, 0, 3)))
 NOTHING_RESOLVED = np.zeros(1025, np.float32)
 
 
@@ -37,7 +41,7 @@ def project(records, camera, window=None):
         records = solid(records)
     window = window or (0, 0, camera.height, camera.width)
     white = np.ones((1, 3), np.float32)
-    optics = compose._optics(camera, UP)
+    optics = optics_of(camera, UP)
     blocks, kinds = sorted_in_blocks(np.asarray(records, np.float32), np.array([len(records)]))
     return project_kernel(
         blocks,
@@ -64,9 +68,9 @@ def transmittance(particles, camera, depth_m=1000.0):
         np.zeros((height, width, 3), np.uint8),
         np.full((height, width), depth_m, np.float32),
         np.zeros((height, width), bool),
-        np.empty((0, 0), np.float32),
+        even_fog(),
         window,
-        compose._optics(camera, UP),
+        optics_of(camera, UP),
         CLEAR_AIR,
         NOTHING_RESOLVED,
         np.zeros(256, np.float32),
@@ -294,14 +298,25 @@ def test_a_long_wide_streak_is_drawn_in_parts_that_sum_to_the_same():
     assert short[0, 6] > FAINTEST
 
 
+def fields_of_now(weather, seed, ambience, time_s=1.0):
+    air = air_of(weather, time_s, seed)
+    return fields_of(weather, seed, air, ambience.axes_world, DEFAULT_OPTIONS, None)
+
+
+def blown(field):
+    """Horizontal velocity of the field's particles, world axes."""
+    falls = field.population.fall_speed_m_per_s[:, None] * field.axes_world[2]
+    return (field.velocity_world_m_per_s + falls)[0]
+
+
 def test_wind_blows_to_the_left_of_the_street(ambience):
     """A Weather's wind, through its fields, in world axes: heading x, left y."""
     weather = Weather(rain_mm_per_h=5.0, wind_m_per_s=(1.0, 3.0, 0.0))
-    (field,) = compose._fields(weather, 0, ambience)
-    np.testing.assert_allclose(field.wind_world_m_per_s, [1.0, 3.0, 0.0])
+    (field,) = fields_of_now(weather, 0, ambience)
+    np.testing.assert_allclose(blown(field), [1.0, 3.0, 0.0])
     turned = replace(ambience, axes_world=np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]))
-    (field,) = compose._fields(weather, 0, turned)
-    np.testing.assert_allclose(field.wind_world_m_per_s, [-3.0, 1.0, 0.0])
+    (field,) = fields_of_now(weather, 0, turned)
+    np.testing.assert_allclose(blown(field), [-3.0, 1.0, 0.0])
 
 
 def test_large_near_flakes_cover_the_label(ambience):
@@ -327,7 +342,7 @@ def test_two_kinds_share_the_budget(ambience):
     for weather in (Weather(snow_mm_per_h=4.0), storm):
         shot = render(frame, weather, seed=1, ambience=ambience, options=RenderOptions(4_000))
         assert shot.image.shape == (360, 640, 3)
-        fields = compose._fields(weather, 1, ambience)
+        fields = fields_of_now(weather, 1, ambience)
         counts.append(sum(f.resolve(camera, 4_000 // len(fields)).expected_count for f in fields))
     assert max(counts) <= 4_000
 
@@ -356,11 +371,11 @@ def test_whole_frame_agrees_with_the_reference(weather, ambience):
     depth = rng.uniform(3, 60, (120, 200)).astype(np.float32)
     image = rng.integers(20, 200, (120, 200, 3), dtype=np.uint8)
     frame = make_frame(camera, image, depth)
-    weather = Weather.from_dict(weather.to_dict() | {"overcast": 0.0})
+    weather = replace(weather, overcast=0.0, spray_per_km=0.0)
     options = RenderOptions(2_000)
     shot = render(frame, weather, seed=4, ambience=ambience, options=options)
 
-    (field,) = compose._fields(weather, 4, ambience)
+    (field,) = fields_of_now(weather, 4, ambience)
     resolved = field.resolve(camera, options.max_particles)
     particles = field.particles(camera, frame.time_s, resolved, (0, 0, 120, 200))
     bins = len(resolved.optical_depth) - 1
@@ -375,7 +390,7 @@ def test_whole_frame_agrees_with_the_reference(weather, ambience):
         return np.exp(-optical_depth(z, ray, up, 0.0, 0.0, haze, extinction, carried))
 
     optical_depth = reference.optical_depth
-    colour = {"rain": compose.rain_colour, "snow": compose.snow_colour}[field.population.kind]
+    colour = {"rain": rain_colour, "snow": snow_colour}[field.population.kind]
 
     def colour_at(position):
         ray = position[:2] / position[2]
@@ -450,7 +465,7 @@ def test_particles_never_brighten_a_bright_sky(kind, ambience):
 
 
 def test_drops_and_flakes_are_darker_than_the_sky_and_brighter_than_a_black_wall(ambience):
-    for colour in (compose.rain_colour(ambience), compose.snow_colour(ambience)):
+    for colour in (rain_colour(ambience), snow_colour(ambience)):
         assert (colour < 0.98 * ambience.sky + 1e-9).all()
         assert (colour > ambience.ground).all()
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from weather_aug.air import Air
 from weather_aug.clip.types import FrameKey
 from weather_aug.errors import ArgumentError, OutputError
 from weather_aug.scene.scene import WeatherScene
@@ -103,8 +104,8 @@ def test_a_sweep_shows_each_weather_and_severity(tiny_scene: WeatherScene) -> No
     for row, make in enumerate((Weather.rain, Weather.snow, Weather.fog)):
         assert (tile(sheet, row, 0) == tiny_scene.frame(key).image).all()
         for column, severity in enumerate(("light", "moderate", "heavy", "extreme"), start=1):
-            still = (0.0, 0.0, 0.0)
-            expected = tiny_scene.render(key, make(severity), seed=3, drift_m=still).image
+            weather = make(severity)
+            expected = tiny_scene.render(key, weather, seed=3, air=Air.held(weather)).image
             assert (tile(sheet, row, column) == expected).all(), (row, severity)
 
 
@@ -136,7 +137,8 @@ def test_a_contact_sheet_shows_label_and_transmittance_below(tiny_scene: Weather
     keys = tiny_scene.keys[:2]
     sheet = contact_sheet(tiny_scene, keys, severities=("heavy",), tile_width=64)
     assert sheet.shape == (HEADER + 6 * (48 + MARGIN), HEADER + 4 * (64 + MARGIN), 3)
-    shot = tiny_scene.render(keys[1], Weather.snow("heavy"))
+    weather = Weather.snow("heavy")
+    shot = tiny_scene.render(keys[1], weather, air=Air.held(weather))
     assert shot.label is not None
     assert (tile(sheet, 3, 2) == shot.image).all()
     assert (tile(sheet, 4, 2) == coloured(shot.label)).all()

@@ -146,7 +146,7 @@ def published_splats(
     ]
     clouds = [field.particles(camera, time_s, window) for field in fields]
     greys = [np.full(3, field.grey_srgb) for field in fields]
-    still, clear = still_optics(optics, camera), Medium(*(np.float32(0.0),) * 6)
+    still, clear = still_optics(optics, camera), Medium(*(np.float32(0.0),) * 7)
     clear = clear._replace(resolved_step_m=np.float32(1.0))
     nothing = np.zeros(2, np.float32)
     return _projected(clouds, greys, still, clear, nothing, np.zeros(3), window, False)

@@ -47,7 +47,9 @@ class Medium(NamedTuple):
     precipitation_per_m: np.float32
     resolved_step_m: np.float32
     spray_per_m: np.float32
-    """At the camera's height."""
+    """At the road's surface."""
+    camera_heights: np.float32
+    """Height of the camera over the road, in scale heights of the spray."""
 
 
 SPRAY_HEIGHT_M = 0.5
@@ -94,6 +96,23 @@ def layer_share(heights):
 
 
 @inlined
+def spray_share(heights, camera_heights):
+    """Mean density along a ray that climbs by `heights` scale heights, over that at the road.
+
+    The layer is as dense below the road's plane as on it: a road that falls away, or noise in the
+    depth, must not run into a layer that grows without end.
+    """
+    zero, one = np.float32(0.0), np.float32(1.0)
+    lowest = -camera_heights
+    at_camera = survival(camera_heights)
+    above = at_camera * layer_share(heights if heights > lowest else lowest)
+    deeper = heights if heights < lowest else lowest
+    under = one - lowest / (deeper if deeper < np.float32(-0.01) else np.float32(-0.01))
+    under = under if (heights < lowest) & (under > zero) else zero
+    return above + under * (one - above)
+
+
+@inlined
 def carried_at(z, resolved_depth, medium):
     """Optical depth of drawn particles, on the axis, up to depth z."""
     last = np.float32(resolved_depth.shape[0] - 1)
@@ -113,7 +132,7 @@ def near_optical_depth(z, ray_x, ray_y, optics, medium, carried):
     norm = np.sqrt(one + ray_x * ray_x + ray_y * ray_y)
     rise = optics.up_x * ray_x + optics.up_y * ray_y + optics.up_z
     fog = layer_share(z * rise * medium.inverse_height_per_m)
-    spray = layer_share(z * rise * np.float32(1.0 / SPRAY_HEIGHT_M))
+    spray = spray_share(z * rise * np.float32(1.0 / SPRAY_HEIGHT_M), medium.camera_heights)
     rest = medium.precipitation_per_m * z - carried
     rest = rest if rest > zero else zero
     tau = medium.fog_per_m * fog + medium.spray_per_m * spray + medium.haze_per_m
@@ -178,7 +197,8 @@ def transmittance_row(ray_x, ray_y, slant, share, optics, medium, resolved_depth
     if medium.spray_per_m > zero:
         for x in range(width):
             rise = optics.up_x * ray_x[x] + rise_y
-            spray = layer_share(out[x] * rise * np.float32(1.0 / SPRAY_HEIGHT_M))
+            climb = out[x] * rise * np.float32(1.0 / SPRAY_HEIGHT_M)
+            spray = spray_share(climb, medium.camera_heights)
             tau[x] += medium.spray_per_m * spray * out[x] * slant[x]
     if medium.precipitation_per_m > zero:
         last = np.float32(resolved_depth.shape[0] - 1)

@@ -271,8 +271,8 @@ def split_by_band(splats, window, bands):
 def _bands_of(splats, i, top, height):
     """First and last band that splat `i` touches."""
     v, half = splats[i, 1], splats[i, 12]
-    low = min(max(np.int64(np.floor(v - half)) - top, 0), height - 1)
-    high = max(min(np.int64(np.ceil(v + half)) - top, height - 1), low)
+    low = min(max(int(np.floor(v - half)) - top, 0), height - 1)
+    high = max(min(int(np.ceil(v + half)) - top, height - 1), low)
     return low // BAND_ROWS, high // BAND_ROWS
 
 

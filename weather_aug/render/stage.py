@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -209,13 +208,13 @@ def optics_of(camera: Camera, up_world: Float64) -> Optics:
 
 def medium_of(weather: Weather, fields: Sequence[ParticleField], ambience: Ambience) -> Medium:
     """What the kernels know of the air."""
-    at_camera = math.exp(-ambience.camera_height_m / SPRAY_HEIGHT_M)
     values = (
         weather.fog_per_m,
         1.0 / weather.fog_scale_height_m,
         weather.mist_per_km * 1e-3,
         sum(field.population.extinction_per_m for field in fields),
         FAR_M / DEPTH_BINS,
-        weather.spray_per_km * 1e-3 * at_camera,
+        weather.spray_per_km * 1e-3,
+        ambience.camera_height_m / SPRAY_HEIGHT_M,
     )
     return Medium(*(np.float32(v) for v in values))

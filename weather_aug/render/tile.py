@@ -44,13 +44,13 @@ def blend_band(splats, window, band_top, planes, tiles):
         shape = (s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7])
         colour = (s[8], s[9], s[10])
         half_v, half_u, lean = s[12], s[13], s[14]
-        first = max(np.int64(np.floor(v - half_v)), 0) >> 2
-        last = min(np.int64(np.ceil(v + half_v)), rows - 1) >> 2
+        first = max(int(np.floor(v - half_v)), 0) >> 2
+        last = min(int(np.ceil(v + half_v)), rows - 1) >> 2
         half_u += abs(lean) * np.float32(1.5)
         for i in range(first, last + 1):
             middle = u + lean * (np.float32(4 * i) + np.float32(1.5) - v)
-            start = max(np.int64(np.floor(middle - half_u)), 0) >> 2
-            stop = min(np.int64(np.ceil(middle + half_u)), columns - 1) >> 2
+            start = max(int(np.floor(middle - half_u)), 0) >> 2
+            stop = min(int(np.ceil(middle + half_u)), columns - 1) >> 2
             for j in range(start, stop + 1):
                 x, y = np.float32(left + 4 * j), np.float32(top + band_top + 4 * i)
                 _blend(tiles[i, j], shape, colour, x, y)
@@ -129,10 +129,10 @@ def cover_splat(splat, rows, window, planes, covered):
     top, left, _, width = window
     u, v, half_v = splat[0] - np.float32(left), splat[1] - np.float32(top), splat[12]
     half_u = half_v * abs(splat[14]) + splat[13]
-    first = max(np.int64(np.floor(v - half_v)), rows[0])
-    last = min(np.int64(np.ceil(v + half_v)), rows[1] - 1)
-    start = max(np.int64(np.floor(u - half_u)), 0)
-    stop = min(np.int64(np.ceil(u + half_u)), width - 1)
+    first = max(int(np.floor(v - half_v)), rows[0])
+    last = min(int(np.ceil(v + half_v)), rows[1] - 1)
+    start = max(int(np.floor(u - half_u)), 0)
+    stop = min(int(np.ceil(u + half_u)), width - 1)
     for y in range(first, last + 1):
         for x in range(start, stop + 1):
             dx, dy = np.float32(x + left) - splat[0], np.float32(y + top) - splat[1]

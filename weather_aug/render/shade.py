@@ -134,10 +134,9 @@ def shade(
             k = y - y0
             for channel in range(3):
                 if tone.encoded > np.float32(0.0):
-                    _level_row(planes[k, channel, :width])
+                    _level_row(planes[k, channel, :width], out[channel, y])
                 else:
-                    encode_row(planes[k, channel, :width])
-                _quantise_row(planes[k, channel, :width], out[channel, y])
+                    encode_row(planes[k, channel, :width], out[channel, y])
             through[y] = planes[k, 3, :width]
             _distinct_row(gap[k], through[y], sky[k], least_contrast, distinct[y])
             hidden += _count_below(through[y], sky[k], hazy)
@@ -184,8 +183,8 @@ def _fog_row(through, airlight, red, green, blue, gap):
 
 
 @compiled
-def encode_row(light):
-    """Turn linear light into sRGB levels plus one half, in place, to 0.1 of a level.
+def encode_row(light, out):
+    """Turn linear light into sRGB levels, rounded, with an error of 0.1 of a level before that.
 
     A polynomial in the square root on the power branch (largest error 0.083 levels), the exact
     line below it; every 8-bit level survives decoding and encoding.
@@ -202,24 +201,18 @@ def encode_row(light):
         p = np.float32(1.5179509) + s * p
         p = np.float32(-0.0401096) + s * p
         p = p if v > np.float32(0.0031308) else np.float32(12.92) * v
-        light[x] = p * np.float32(255.0) + np.float32(0.5)
+        out[x] = np.uint8(np.int32(p * np.float32(255.0) + np.float32(0.5)))
 
 
 @compiled
-def _level_row(light):
-    """Turn colours that are sRGB already into levels plus one half, in place."""
+def _level_row(light, out):
+    """Turn colours that are sRGB already into levels, rounded."""
     zero, one = np.float32(0.0), np.float32(1.0)
     for x in range(light.shape[0]):
         v = light[x]
         v = v if v > zero else zero
         v = v if v < one else one
-        light[x] = v * np.float32(255.0) + np.float32(0.5)
-
-
-@compiled
-def _quantise_row(levels, out):
-    for x in range(levels.shape[0]):
-        out[x] = np.uint8(np.int32(levels[x]))
+        out[x] = np.uint8(np.int32(v * np.float32(255.0) + np.float32(0.5)))
 
 
 @compiled

@@ -144,6 +144,8 @@ class Stage:
 
     def _patches(self) -> FogVolume:
         weather, axes = self.weather, self.ambience.axes_world
+        if weather.fog_patchiness == weather.fog_puffs == 0.0:
+            return even_fog()
         volume = fog_volume(
             self.camera,
             self.window,

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.crowds import DENSEST
+from benchmarks.crowds import KINDS
 from benchmarks.drawn import drawn
 from benchmarks.overlays import CASES, FOG, IN_VIEW, peers
 from benchmarks.scene import street
@@ -57,7 +57,7 @@ def by_particles() -> dict[str, Any]:
     frame, ambience = street(HEIGHT, WIDTH)
     call = partial(render, frame, seed=1, ambience=ambience)
     runs: dict[str, Callable[[], object]] = {"fog": partial(call, FOG, options=RenderOptions(0))}
-    for kind, weather in DENSEST.items():
+    for kind, weather in KINDS.items():
         for budget in (0, *BUDGETS):
             runs[f"{kind} {budget}"] = partial(call, weather, options=RenderOptions(budget))
     others = peers()
@@ -65,7 +65,7 @@ def by_particles() -> dict[str, Any]:
     ms = interleaved(runs, ROUNDS)
     print(f"\n{HEIGHT} x {WIDTH}: ms against particles drawn (the fog pass: {ms['fog']:.1f} ms)")
     curves = {}
-    for kind in DENSEST:
+    for kind in KINDS:
         counts = [drawn(runs[f"{kind} {b}"], HEIGHT, WIDTH).particles for b in BUDGETS]
         values = [ms[f"{kind} {b}"] for b in BUDGETS]
         without = ms[f"{kind} 0"]

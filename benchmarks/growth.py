@@ -25,6 +25,7 @@ SIZES = ((240, 426), (360, 640), (540, 960), (720, 1280), (1080, 1920), (1440, 2
 BY_PIXELS = ("fog", "fog + rain 20k", "fog + snow 20k")
 SLOW_PEERS = ("RandomRain (heavy)", "RandomSnow (texture)", "RandomFog (0.5-0.8)")
 ROUNDS, SLOW_ROUNDS = 7, 3
+LEAST_GROWTH = 1.25
 
 
 class Power(NamedTuple):
@@ -52,7 +53,7 @@ def measure() -> dict[str, Any]:
 def by_particles() -> dict[str, Any]:
     """Milliseconds against particles drawn, and the exponent of what they add to the fog pass.
 
-    The fit leaves out what is too little beside the fog pass to be told from noise.
+    The fit leaves out counts that add less than a quarter: there fixed costs and noise rule.
     """
     frame, ambience = street(HEIGHT, WIDTH)
     call = partial(render, frame, seed=1, ambience=ambience)
@@ -69,7 +70,11 @@ def by_particles() -> dict[str, Any]:
         counts = [drawn(runs[f"{kind} {b}"], HEIGHT, WIDTH).particles for b in BUDGETS]
         values = [ms[f"{kind} {b}"] for b in BUDGETS]
         without = ms[f"{kind} 0"]
-        clear = [(n, v - without) for n, v in zip(counts, values, strict=True) if v > 1.1 * without]
+        clear = [
+            (n, v - without)
+            for n, v in zip(counts, values, strict=True)
+            if v > LEAST_GROWTH * without
+        ]
         fit = fitted_power(*zip(*clear, strict=True))
         print(f"  {kind}:", ", ".join(f"{n}: {v:.1f}" for n, v in zip(counts, values, strict=True)))
         print(f"    without particles {without:.1f} ms; they add n^{fit.exponent:.2f}", flush=True)

@@ -41,8 +41,8 @@ CASES = {
     "fog + snow 20k": (SNOW, IN_VIEW),
 }
 COPY, FAR_COPY = "copy of the frame, in cache", "copy of the frame, in memory"
-FAR_COPIES = 64
-"""Frames that are copied in turns, so that none is in the cache any more when it comes."""
+FAR_BYTES = 2**27
+"""Frames of this many bytes are copied in turns, so that none is still in the cache."""
 
 
 def peers() -> dict[str, A.BasicTransform | A.Compose]:
@@ -135,7 +135,7 @@ def _copies_in_turns(image: NDArray[np.uint8]) -> Callable[[], object]:
     turn = count()
 
     def run() -> None:
-        k = next(turn) % FAR_COPIES
+        k = next(turn) % copies
         np.copyto(targets[k], sources[k])
 
     return run

@@ -128,10 +128,9 @@ def ratios(ms: Mapping[str, float]) -> list[Row]:
 
 
 def _copies_in_turns(image: NDArray[np.uint8]) -> Callable[[], object]:
-    sources, targets = (
-        np.stack([image] * FAR_COPIES),
-        np.zeros((FAR_COPIES, *image.shape), np.uint8),
-    )
+    copies = -(-FAR_BYTES // image.nbytes)
+    sources = np.stack([image] * copies)
+    targets = np.zeros_like(sources)
     turn = count()
 
     def run() -> None:

@@ -17,6 +17,14 @@ def test_budget_is_kept_and_used():
         assert 0.95 * budget < resolved.expected_count <= budget
 
 
+@pytest.mark.parametrize("rate", [5.0, 20.0, 50.0])
+@pytest.mark.parametrize("budget", [300, 3_000])
+def test_a_small_budget_is_used_in_dense_snow(rate, budget):
+    """Near flakes are equally opaque, so that no threshold lets in only some of them."""
+    resolved = field(statistics.snow(rate)).resolve(camera(), budget)
+    assert 0.95 * budget < resolved.expected_count <= budget
+
+
 @pytest.mark.parametrize(("rate", "reference"), [(2.5, 17_000), (10.0, 68_000), (50.0, 308_000)])
 def test_drops_that_a_driving_camera_resolves(rate, reference):
     """KITTI's camera at 10 m/s, counted before by integrating over the mean image streak."""

@@ -101,7 +101,9 @@ def solve_reach(
 ):
     """Smallest opacity threshold whose expected particle count keeps the budget, by bisection.
 
-    A size whose reach would be under `least_m` is not drawn at all.
+    A particle wider than a pixel is as opaque near as far, so that a threshold may let in all of a
+    dense size or none: then the depth is bounded too, so that the budget is used. A size whose
+    reach would be under `least_m` is not drawn at all.
 
     Returns:
         The threshold, reach (C, Q) in metres, and the expected count.
@@ -120,7 +122,18 @@ def solve_reach(
         else:
             high = middle
     count = _fill_reach(*args, high, *limits)
-    return high, reach_m, count
+    if count > 0.95 * budget:
+        return high, reach_m, count
+    nearer, farther = least_m, far_m
+    for _ in range(24):
+        middle = 0.5 * (nearer + farther)
+        if _fill_reach(*args, low, near_m, least_m, middle, reach_m) > budget:
+            farther = middle
+        else:
+            nearer = middle
+    if _fill_reach(*args, low, near_m, least_m, nearer, reach_m) < count:
+        return high, reach_m, _fill_reach(*args, high, *limits)
+    return low, reach_m, _fill_reach(*args, low, near_m, least_m, nearer, reach_m)
 
 
 @compiled

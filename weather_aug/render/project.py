@@ -248,32 +248,28 @@ def split_by_band(splats, window, bands):
     Returns:
         (M, 16) float32 and (bands + 1,) int64.
     """
-    top, _, height, _ = window
+    n = splats.shape[0]
+    first, last = np.empty(n, np.int32), np.empty(n, np.int32)
     starts = np.zeros(bands + 1, np.int64)
-    for i in range(splats.shape[0]):
-        first, last = _bands_of(splats, i, top, height)
-        for band in range(first, last + 1):
+    top, _, height, _ = window
+    bottom = np.float32(height - 1)
+    for i in range(n):
+        v, half = splats[i, 1] - np.float32(top), splats[i, 12]
+        low, high = np.floor(v - half), np.ceil(v + half)
+        first[i] = np.int32(min(max(low, np.float32(0.0)), bottom)) // np.int32(BAND_ROWS)
+        last[i] = np.int32(max(min(high, bottom), np.float32(0.0))) // np.int32(BAND_ROWS)
+        for band in range(first[i], last[i] + 1):
             starts[band + 1] += 1
     for band in range(bands):
         starts[band + 1] += starts[band]
-    out = np.empty((starts[bands], splats.shape[1]), np.float32)
+    out = np.empty((starts[bands], 16), np.float32)
     fill = starts[:-1].copy()
-    for i in range(splats.shape[0]):
-        first, last = _bands_of(splats, i, top, height)
-        for band in range(first, last + 1):
+    for i in range(n):
+        for band in range(first[i], last[i] + 1):
             for k in range(16):
                 out[fill[band], k] = splats[i, k]
             fill[band] += 1
     return out, starts
-
-
-@inlined
-def _bands_of(splats, i, top, height):
-    """First and last band that splat `i` touches."""
-    v, half = splats[i, 1], splats[i, 12]
-    low = min(max(int(np.floor(v - half)) - top, 0), height - 1)
-    high = max(min(int(np.ceil(v + half)) - top, height - 1), low)
-    return low // BAND_ROWS, high // BAND_ROWS
 
 
 @compiled

@@ -137,7 +137,7 @@ def shade(
                     _level_row(planes[k, channel, :width], out[channel, y])
                 else:
                     encode_row(planes[k, channel, :width], out[channel, y])
-            through[y] = planes[k, 3, :width]
+            _copy_row(planes[k, 3, :width], through[y])
             _distinct_row(gap[k], through[y], sky[k], least_contrast, distinct[y])
             hidden += _count_below(through[y], sky[k], hazy)
     return hidden
@@ -213,6 +213,13 @@ def _level_row(light, out):
         v = v if v > zero else zero
         v = v if v < one else one
         out[x] = np.uint8(np.int32(v * np.float32(255.0) + np.float32(0.5)))
+
+
+@compiled
+def _copy_row(row, out):
+    """Copy in a loop: an assignment of slices takes its time to compare shapes and overlaps."""
+    for x in range(row.shape[0]):
+        out[x] = row[x]
 
 
 @compiled

@@ -24,7 +24,9 @@ FOG = Weather(visibility_m=120.0, fog_scale_height_m=30.0)
 WEATHERS = {
     "rain": Weather(rain_mm_per_h=75.0),
     "snow": Weather.snow("extreme"),
-    "wet snow": Weather.snow("heavy", snow_wetness=0.8, gustiness=0.4),
+    "wet snow": Weather(
+        snow_mm_per_h=12.0, snow_wetness=0.8, wind_m_per_s=(2, 4, 0), gustiness=0.4
+    ),
     "spray": Weather(spray_per_km=150.0),
     "even fog": Weather(visibility_m=80.0),
     "fog": replace(Weather.fog("heavy"), overcast=0.0),
@@ -35,6 +37,8 @@ WEATHERS = {
     "rain and fog": Weather.mix(replace(FOG, fog_patchiness=0.5), Weather.rain("extreme")),
     "rain and snow": Weather.mix(Weather.rain("heavy"), Weather.snow("heavy")),
 }
+AGREEMENT_DB = 50
+"""At least this near to `render`; its own rounding to 8 bits alone is 59 dB."""
 MOTIONS = {
     "parked": {},
     "driving": {"velocity_m_per_s": np.array([14.0, 0.3, 0])},

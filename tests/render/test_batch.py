@@ -111,18 +111,33 @@ def test_the_agreement_would_notice(fault, name, monkeypatch):
     assert psnr(batch([case]).image[0], case.alone().image) < 45
 
 
-def test_a_picture_does_not_depend_on_its_batch():
+@pytest.mark.parametrize("splatting", WAYS)
+def test_a_picture_does_not_depend_on_its_batch(splatting):
     cases = [
         Case(street("driving", time_s=2.0), WEATHERS["snow"], seed=8),
         Case(street(), Weather.clear()),
         Case(street("turning"), WEATHERS["rain and fog"], seed=2**64 - 1),
     ]
-    together, again = batch(cases), batch(cases)
+    together, again = (batch(cases, splatting=splatting) for _ in range(2))
     for k, case in enumerate(cases):
-        alone = batch([case])
+        alone = batch([case], splatting=splatting)
         for name in ("image", "label", "invalid", "transmittance", "depth"):
             assert torch.equal(getattr(together, name)[k], getattr(alone, name)[0])
             assert torch.equal(getattr(together, name), getattr(again, name))
+
+
+def test_a_picture_does_not_depend_on_the_rows_shaded_together(monkeypatch):
+    case = Case(street("driving"), WEATHERS["rain and fog"])
+    expected = batch([case])
+    monkeypatch.setattr(batch_module, "ROWS_AT_ONCE", 7)
+    torch.testing.assert_close(batch([case]).image, expected.image, atol=1e-6, rtol=0)
+
+
+def test_auto_draws_with_the_kernels_on_a_cpu():
+    case = Case(street(), WEATHERS["rain and snow"])
+    images = [batch([case], splatting=way).image for way in ("auto", *WAYS)]
+    assert torch.equal(images[0], images[2])
+    assert not torch.equal(images[0], images[1])
 
 
 def test_clear_weather_gives_the_pictures_back():

@@ -35,6 +35,7 @@ from weather_aug.render.batch_checks import (
 from weather_aug.render.batch_fog import fog_shares
 from weather_aug.render.batch_medium import AirColumn, pixel_rays
 from weather_aug.render.batch_particles import Job, Particles, particle_layer, splatting_on
+from weather_aug.render.batch_splat import Layer
 from weather_aug.render.fields import RigMotion
 from weather_aug.render.fog import fog_volume
 from weather_aug.render.label import least_linear_contrast
@@ -43,6 +44,9 @@ from weather_aug.render.medium import FAR_DEPTH_M
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.taxonomy import SKY
 from weather_aug.weather import Weather
+
+ROWS_AT_ONCE = 32
+"""Rows that a CPU shades together: in the cache, and in memory that is not given back meanwhile."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +141,8 @@ def render_batch(
         air = air or air_of(weather, time_s, seed)
         job = Job(camera, weather, seed, ambience, time_s, air, rig, shelter, options, splatting)
         label = None if labels is None else labels[k]
-        shots.append(_rendered(images[k].to(dtype), depth[k], label, job))
+        image = images[k].to(dtype).contiguous()
+        shots.append(_rendered(image, depth[k], label, job))
     found = [shot.label for shot in shots if shot.label is not None]
     return RenderedBatch(
         image=torch.stack([shot.image for shot in shots]).to(images.dtype),
@@ -162,21 +167,41 @@ def _rendered(image: Tensor, depth: Tensor, label: Tensor | None, job: Job) -> _
         invalid = torch.zeros(depth.shape, dtype=torch.uint8, device=depth.device)
         kept = None if label is None else label.clone()
         return _Shot(image.clone(), kept, invalid, torch.ones_like(depth))
-    light = job.ambience
     particles = Particles.of(job)
     air = AirColumn.of(particles.medium, particles.optics, particles.carried, image)
     rays = pixel_rays(job.camera, image)
     sky = batch_shade.neighbourhood(torch.isinf(depth)) if label is None else label == SKY
-    airlight = image.new_tensor(light.airlight)
-    toned = batch_shade.toned_light(image, sky, rays, job.weather.overcast, light, air)
     clear = _clear_share(depth, rays, air, job)
     layer = particle_layer(particles, air, depth.float())
-    seen = layer.over(batch_shade.veiled(toned, clear, airlight))
+    at_once = ROWS_AT_ONCE if image.device.type == "cpu" else len(depth)
+    bands = []
+    for top in range(0, len(depth), at_once):
+        rows = slice(top, top + at_once)
+        tangents = (rays[0], rays[1][rows])
+        behind = (image[:, rows], sky[rows], tangents, clear[rows])
+        bands.append(_shaded(*behind, layer.rows(rows), air, job))
+    shaded, gap = (torch.cat(parts, dim=-2) for parts in zip(*bands, strict=True))
     through = clear * layer.through.to(clear.dtype)
-    gap = (toned.detach() - airlight[:, None, None]).abs().amax(dim=0)
-    distinct = gap * through >= least_linear_contrast(light.airlight)
+    distinct = gap * through >= least_linear_contrast(job.ambience.airlight)
     honest, invalid = batch_shade.readable(label, through, distinct, layer.covered)
-    return _Shot(batch_shade.encoded(seen), honest, invalid, through)
+    return _Shot(shaded, honest, invalid, through)
+
+
+def _shaded(
+    image: Tensor,
+    sky: Tensor,
+    rays: tuple[Tensor, Tensor],
+    clear: Tensor,
+    layer: Layer,
+    air: AirColumn,
+    job: Job,
+) -> tuple[Tensor, Tensor]:
+    """Rows of the picture, and how far (linear light) their surfaces are from the airlight."""
+    airlight = image.new_tensor(job.ambience.airlight)
+    toned = batch_shade.toned_light(image, sky, rays, job.weather.overcast, job.ambience, air)
+    seen = layer.over(batch_shade.veiled(toned, clear, airlight))
+    gap = (toned.detach() - airlight[:, None, None]).abs().amax(dim=0)
+    return batch_shade.encoded(seen), gap
 
 
 def _clear_share(depth: Tensor, rays: tuple[Tensor, Tensor], air: AirColumn, job: Job) -> Tensor:

@@ -41,6 +41,10 @@ class Layer:
         """The layer in front of linear light (3, H, W)."""
         return self.light.to(light.dtype) + self.through.to(light.dtype) * light
 
+    def rows(self, rows: slice) -> Layer:
+        """A view of some rows of the picture."""
+        return Layer(self.light[:, rows], self.through[rows], self.covered[rows])
+
 
 def empty_layer(depth_m: Tensor) -> Layer:
     """A layer of no particles for a picture (H, W), on the depth's device."""

@@ -1,8 +1,8 @@
 """The torch renderer against the compiled one at 512 x 1024; on CUDA too where there is one.
 
-`python -m benchmarks.batch`. "batch" draws particles with the compiled kernels, as it does by itself
-on a CPU; "torch" with torch alone. On a CPU `render` is the one to use; a batch is for pictures that
-live on a GPU and for gradients.
+`python -m benchmarks.batch`. "batch" draws particles with the compiled kernels, as it does on a CPU
+if not told otherwise; "torch" with torch alone. On a CPU `render` is the one to use; a batch is for
+pictures that live on a GPU and for gradients.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from torch import Tensor
 from weather_aug.render.batch_project import Splats
 
 FRAGMENTS_AT_ONCE = {"cpu": 2**16, "cuda": 2**20}
-"""Fragments in memory at once, about 200 bytes each; on a CPU few, so that they stay in the cache."""
+"""Fragments in memory at once, about 200 bytes each; few on a CPU, for its cache."""
 NEAR_EDGE_M = 0.1
 """A particle fades out from this far in front of a surface to as far behind it."""
 HIDING_ALPHA = 0.5

@@ -24,10 +24,21 @@ FOG = Weather(visibility_m=120.0, fog_scale_height_m=30.0)
 WEATHERS = {
     "rain": Weather(rain_mm_per_h=75.0),
     "snow": Weather.snow("extreme"),
+    "wet snow": Weather(
+        snow_mm_per_h=12.0, snow_wetness=0.8, wind_m_per_s=(2, 4, 0), gustiness=0.4
+    ),
+    "spray": Weather(spray_per_km=150.0),
+    "even fog": Weather(visibility_m=80.0),
     "fog": replace(Weather.fog("heavy"), overcast=0.0),
-    "rain and fog": Weather.mix(FOG, Weather.rain("extreme")),
+    "patchy fog": Weather(visibility_m=90.0, fog_patchiness=0.8),
+    "puffy low fog": Weather(
+        visibility_m=90.0, fog_scale_height_m=12.0, fog_patchiness=0.4, fog_puffs=0.4
+    ),
+    "rain and fog": Weather.mix(replace(FOG, fog_patchiness=0.5), Weather.rain("extreme")),
     "rain and snow": Weather.mix(Weather.rain("heavy"), Weather.snow("heavy")),
 }
+AGREEMENT_DB = 50
+"""At least this near to `render`; its own rounding to 8 bits alone is 59 dB."""
 MOTIONS = {
     "parked": {},
     "driving": {"velocity_m_per_s": np.array([14.0, 0.3, 0])},
@@ -46,9 +57,9 @@ class Case:
     weather: Weather
     seed: int = 3
 
-    def alone(self):
+    def alone(self, **choices):
         """By `render`."""
-        return render(self.frame, self.weather, seed=self.seed, ambience=AMBIENCE)
+        return render(self.frame, self.weather, seed=self.seed, ambience=AMBIENCE, **choices)
 
 
 def street(motion="parked", *, width=160, height=96, labelled=True, time_s=1.0, **optics):

@@ -1,42 +1,48 @@
 """render_batch(): the same pictures as render(), in torch, with gradients."""
 
 import sys
-from dataclasses import make_dataclass, replace
+from dataclasses import fields
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from batch_scene import AMBIENCE, MOTIONS, WEATHERS, Case, arguments, batch, psnr, street
+from batch_scene import (
+    AGREEMENT_DB,
+    AMBIENCE,
+    MOTIONS,
+    WEATHERS,
+    Case,
+    arguments,
+    batch,
+    psnr,
+    street,
+)
 
 from weather_aug.air import Air
 from weather_aug.errors import ArgumentError, MissingExtraError
+from weather_aug.particles.shelter import Shelter
 from weather_aug.render import batch as batch_module
-from weather_aug.render import batch_project, batch_shade
-from weather_aug.render import project as compiled_project
+from weather_aug.render import batch_medium, batch_particles, batch_project, batch_shade
 from weather_aug.render.batch import render_batch
-from weather_aug.render.compose import render
+from weather_aug.render.batch_checks import NOT_DRAWN
+from weather_aug.render.fields import RigMotion
 from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
 
-
-@pytest.fixture
-def whole_streaks(monkeypatch):
-    """MERGE: drop this fixture once `project` cuts long streaks, as it does from 36ce008 on."""
-    if not hasattr(compiled_project, "MOST_PARTS"):
-        monkeypatch.setattr(batch_project, "LONG_SWEEP_PX", float("inf"))
+WAYS = ("torch", "compiled")
 
 
-@pytest.mark.usefixtures("whole_streaks")
+@pytest.mark.parametrize("splatting", WAYS)
 @pytest.mark.parametrize(
     ("motion", "labelled"), [*((m, True) for m in MOTIONS), ("driving", False)]
 )
-def test_agrees_with_the_compiled_renderer(motion, labelled):
+def test_agrees_with_the_compiled_renderer(motion, labelled, splatting):
     cases = [Case(street(motion, labelled=labelled), weather) for weather in WEATHERS.values()]
-    shots = batch(cases)
+    shots = batch(cases, splatting=splatting)
     for k, (name, case) in enumerate(zip(WEATHERS, cases, strict=True)):
         expected = case.alone()
-        assert psnr(shots.image[k], expected.image) >= 45, name
+        assert psnr(shots.image[k], expected.image) >= AGREEMENT_DB, name
         through = shots.transmittance[k].numpy()
         assert np.abs(through - expected.transmittance).max() < 0.01, name
         np.testing.assert_array_equal(expected.depth, shots.depth[k].numpy())
@@ -47,11 +53,12 @@ def test_agrees_with_the_compiled_renderer(motion, labelled):
             assert shots.label is None
 
 
-def test_large_flakes_hide_the_same_surfaces():
+@pytest.mark.parametrize("splatting", WAYS)
+def test_large_flakes_hide_the_same_surfaces(splatting):
     """A long lens and a short exposure: flakes of many pixels, sharp and opaque."""
     frame = street(exposure_s=0.0003, aperture_m=0.0, focal_px=500.0)
     case = Case(frame, Weather(snow_mm_per_h=4.0), seed=9)
-    expected, found = case.alone(), batch([case])
+    expected, found = case.alone(), batch([case], splatting=splatting)
     assert (expected.label != frame.label).sum() > 100
     assert (found.label[0].numpy() != expected.label).mean() <= 1e-3
     assert (found.invalid[0].numpy() != expected.invalid).mean() <= 1e-3
@@ -59,7 +66,7 @@ def test_large_flakes_hide_the_same_surfaces():
 
 def without_compensation(monkeypatch):
     wrong = partial(batch_project.project, compensate=False)
-    monkeypatch.setattr(batch_module, "project", wrong)
+    monkeypatch.setattr(batch_particles, "project", wrong)
 
 
 def in_gamma_space(monkeypatch):
@@ -69,26 +76,68 @@ def in_gamma_space(monkeypatch):
     monkeypatch.setattr(batch_shade, "encoded", lambda light: light.clamp(0, 1))
 
 
-@pytest.mark.parametrize("fault", [without_compensation, in_gamma_space])
-@pytest.mark.parametrize("name", ["rain", "snow", "rain and fog"])
+def without_spray(monkeypatch):
+    monkeypatch.setattr(batch_medium, "spray_share", lambda heights, _: 0 * heights)
+
+
+def with_even_fog(monkeypatch):
+    monkeypatch.setattr(batch_module, "fog_shares", lambda _, z_m: torch.ones_like(z_m))
+
+
+def in_still_air(monkeypatch):
+    still = Weather().wind_m_per_s
+    monkeypatch.setattr(batch_module, "air_of", lambda *_: Air(still, still))
+
+
+FAULTS = [
+    (without_compensation, "rain"),
+    (without_compensation, "snow"),
+    (without_compensation, "rain and fog"),
+    (in_gamma_space, "rain"),
+    (in_gamma_space, "snow"),
+    (in_gamma_space, "rain and fog"),
+    (without_spray, "spray"),
+    (with_even_fog, "patchy fog"),
+    (with_even_fog, "puffy low fog"),
+    (in_still_air, "wet snow"),
+    (in_still_air, "snow"),
+]
+
+
+@pytest.mark.parametrize(("fault", "name"), FAULTS)
 def test_the_agreement_would_notice(fault, name, monkeypatch):
     case = Case(street("driving"), WEATHERS[name])
     fault(monkeypatch)
     assert psnr(batch([case]).image[0], case.alone().image) < 45
 
 
-def test_a_picture_does_not_depend_on_its_batch():
+@pytest.mark.parametrize("splatting", WAYS)
+def test_a_picture_does_not_depend_on_its_batch(splatting):
     cases = [
         Case(street("driving", time_s=2.0), WEATHERS["snow"], seed=8),
         Case(street(), Weather.clear()),
         Case(street("turning"), WEATHERS["rain and fog"], seed=2**64 - 1),
     ]
-    together, again = batch(cases), batch(cases)
+    together, again = (batch(cases, splatting=splatting) for _ in range(2))
     for k, case in enumerate(cases):
-        alone = batch([case])
+        alone = batch([case], splatting=splatting)
         for name in ("image", "label", "invalid", "transmittance", "depth"):
             assert torch.equal(getattr(together, name)[k], getattr(alone, name)[0])
             assert torch.equal(getattr(together, name), getattr(again, name))
+
+
+def test_a_picture_does_not_depend_on_the_rows_shaded_together(monkeypatch):
+    case = Case(street("driving"), WEATHERS["rain and fog"])
+    expected = batch([case])
+    monkeypatch.setattr(batch_module, "ROWS_AT_ONCE", 7)
+    torch.testing.assert_close(batch([case]).image, expected.image, atol=1e-6, rtol=0)
+
+
+def test_auto_draws_with_the_kernels_on_a_cpu():
+    case = Case(street(), WEATHERS["rain and snow"])
+    images = [batch([case], splatting=way).image for way in ("auto", *WAYS)]
+    assert torch.equal(images[0], images[2])
+    assert not torch.equal(images[0], images[1])
 
 
 def test_clear_weather_gives_the_pictures_back():
@@ -161,14 +210,42 @@ def test_depth_that_is_nonsense_means_far():
     assert torch.isfinite(shots.transmittance).all()
 
 
-@pytest.mark.usefixtures("whole_streaks")
 def test_the_airs_motion_can_be_given():
     case = Case(street(), WEATHERS["snow"])
-    drift_m = (3.0, -2.0, 0.5)
-    expected = render(case.frame, case.weather, seed=3, ambience=AMBIENCE, drift_m=drift_m)
-    moved = batch([case], airs=[Air(case.weather.wind_m_per_s, drift_m)])
-    assert psnr(moved.image[0], expected.image) >= 45
+    air = Air(case.weather.wind_m_per_s, (3.0, -2.0, 0.5), 1.5)
+    expected = case.alone(air=air)
+    assert psnr(batch([case], airs=[air]).image[0], expected.image) >= AGREEMENT_DB
     assert psnr(batch([case]).image[0], expected.image) < 45
+
+
+@pytest.mark.parametrize("splatting", WAYS)
+def test_no_particles_fall_under_a_roof(splatting):
+    case = Case(street(), WEATHERS["snow"])
+    roof = Shelter(np.full((200, 200), 6.0, np.float32), np.array([-50.0, -50.0, 0.0]), np.eye(3))
+    expected = case.alone(shelter=roof)
+    found = batch([case] * 2, shelters=[roof, None], splatting=splatting)
+    assert psnr(found.image[0], expected.image) >= AGREEMENT_DB
+    assert psnr(found.image[1], expected.image) < 45
+
+
+def test_options_of_the_particles_are_passed_on():
+    frame = street("driving", exposure_s=0.0003, aperture_m=0.0, focal_px=500.0)
+    case = Case(frame, Weather(rain_mm_per_h=200.0, snow_mm_per_h=10.0))
+    here = case.frame.camera.world_from_camera
+    first = here.copy()
+    first[:3, 3] -= (14.0, 0.3, 0.0)
+    rig = RigMotion(first, here)
+    plain = case.alone()
+    for choices in (
+        {"options": RenderOptions(alignment="camera"), "rig": rig},
+        {"options": RenderOptions(rain_fall_speed="atlas")},
+        {"options": RenderOptions(max_particles=300)},
+    ):
+        expected = case.alone(**choices)
+        rigs = [choices["rig"]] if "rig" in choices else None
+        found = batch([case], options=choices["options"], rigs=rigs)
+        assert psnr(found.image[0], expected.image) >= AGREEMENT_DB
+        assert psnr(found.image[0], plain.image) < AGREEMENT_DB - 3
 
 
 def test_refusals():
@@ -184,7 +261,9 @@ def test_refusals():
         "seeds": ([1], [1, 2**64], [1, "a"]),
         "ambiences": ([AMBIENCE], [None, None]),
         "times_s": ([0.0], [0.0, np.nan], 0.0),
-        "airs": ([None, None], [Air((0, 0, 0), (0, 0, 0))]),
+        "airs": ([0, None], [Air((0, 0, 0), (0, 0, 0))]),
+        "shelters": (["roof", None], [None]),
+        "rigs": ([np.eye(4), None], [None], 3),
         "options": (None,),
         "splatting": ("cuda", "gsplat"),
     }
@@ -200,19 +279,20 @@ def test_refusals():
 
 def test_what_is_not_drawn_is_refused():
     inputs = arguments([Case(street(width=20, height=12), WEATHERS["fog"])])
-    for name in ("fog_patchiness", "fog_puffs", "spray_per_km", "gustiness"):
-        weather = replace(WEATHERS["fog"])
-        object.__setattr__(weather, name, 0.3)
-        with pytest.raises(ArgumentError, match=name):
-            render_batch(**(inputs | {"weathers": [weather]}))
-    later = make_dataclass("Later", [("blur", bool, True)], bases=(RenderOptions,), frozen=True)
-    with pytest.raises(ArgumentError, match=r"options\.blur"):
-        render_batch(**(inputs | {"options": later()}))
+    for name, value in (("multiple_scattering", True), ("preset", "weatheredit")):
+        with pytest.raises(ArgumentError, match=rf"options\.{name}"):
+            render_batch(**(inputs | {"options": RenderOptions(**{name: value})}))
+
+
+def test_every_option_is_drawn_or_refused():
+    """A new option of `render` has to be thought of here; `ablation` needs a preset."""
+    drawn = {"max_particles", "alignment", "rain_fall_speed"}
+    assert {f.name for f in fields(RenderOptions)} == drawn | {*NOT_DRAWN, "ablation"}
 
 
 def test_gsplat_is_named_when_it_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    monkeypatch.setattr(batch_module, "_splatting", lambda *_: "gsplat")
+    monkeypatch.setattr(batch_module, "splatting_on", lambda *_: "gsplat")
     with pytest.raises(MissingExtraError, match=r"weather-aug\[gsplat\]"):
         batch([Case(street(), WEATHERS["snow"])])
 

@@ -10,8 +10,7 @@ import torch
 from batch_scene import WEATHERS, Case, arguments, street
 
 from weather_aug.errors import MissingExtraError
-from weather_aug.render import batch as batch_module
-from weather_aug.render import batch_gsplat, batch_splat
+from weather_aug.render import batch_gsplat, batch_particles, batch_splat
 from weather_aug.render.batch import render_batch
 from weather_aug.render.batch_gsplat import splat_in_slabs, surfaces_under
 from weather_aug.render.batch_splat import empty_layer, splat
@@ -28,7 +27,7 @@ def scene():
         return empty_layer(depth)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(batch_module, "splat", catch)
+        patch.setattr(batch_particles, "splat", catch)
         render_batch(**arguments([case]))
     return caught["scene"]
 

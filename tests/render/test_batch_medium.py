@@ -1,5 +1,7 @@
 """Optical depth in torch against the slow reference."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -20,8 +22,13 @@ AIRS = {
 UP = np.array([0.05, -0.995, -0.086])
 
 
-def column(values):
-    return AirColumn(*values, torch.from_numpy(RESOLVED), STEP_M, tuple(UP.tolist()))
+def column(values, spray_per_m=0.0, camera_heights=3.0):
+    resolved = torch.from_numpy(RESOLVED)
+    return AirColumn(*values, STEP_M, spray_per_m, camera_heights, resolved, tuple(UP.tolist()))
+
+
+def optical_depth(air, z, rays):
+    return air.optical_depth(air.reach_m(z, *rays), *rays)
 
 
 def depths(camera):
@@ -40,8 +47,26 @@ def test_agrees_with_the_slow_reference(name):
 
     expected = reference.optical_depth(z, reference.rays(camera), UP, *AIRS[name], carried)
     rays = pixel_rays(camera, torch.zeros((), dtype=torch.float64))
-    found = column(AIRS[name]).optical_depth(torch.from_numpy(z), *rays)
+    found = optical_depth(column(AIRS[name]), torch.from_numpy(z), rays)
     np.testing.assert_allclose(np.exp(-found.numpy()), np.exp(-expected), atol=1e-4)
     single = pixel_rays(camera, torch.zeros(()))
-    coarse = column(AIRS[name]).optical_depth(torch.from_numpy(z).float(), *single)
+    coarse = optical_depth(column(AIRS[name]), torch.from_numpy(z).float(), single)
     np.testing.assert_allclose(np.exp(-coarse.numpy()), np.exp(-expected), atol=1e-4)
+
+
+@pytest.mark.parametrize("spray_height_m", [0.5, 0.8])
+def test_spray_is_the_sum_of_its_density_along_the_ray(spray_height_m):
+    """Density 1 at and under the road's plane, thinning with 0.5 m; another height must show."""
+    camera_height_m, spray_per_m = 1.4, 0.05
+    climb = np.array([-0.3, -0.09, -0.02, -0.001, 0.0, 0.001, 0.05, 0.4])
+    z = np.array([1.0, 6.0, 17.0, 60.0])[:, None]
+    steps = (np.arange(20_000) + 0.5) / 20_000
+    height_m = camera_height_m + z[..., None] * climb[:, None] * steps
+    density = np.exp(-np.maximum(height_m, 0.0) / spray_height_m).mean(axis=-1)
+    expected = spray_per_m * density * z * np.sqrt(1 + climb**2)
+    air = column((0.0, 0.0, 0.0, 0.0), spray_per_m, camera_height_m / 0.5)
+    air = replace(air, up_camera=(0.0, 1.0, 0.0))
+    tangents = torch.from_numpy(climb)
+    found = air.optical_depth(torch.from_numpy(z), torch.zeros_like(tangents), tangents)
+    error = np.abs(found.numpy() - expected).max()
+    assert (error < 2e-3) == (spray_height_m == 0.5)

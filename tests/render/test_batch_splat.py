@@ -8,27 +8,35 @@ from render_scene import make_camera
 from scipy.special import erf
 
 from weather_aug.render import batch_project
-from weather_aug.render.batch import _records_of_discs
 from weather_aug.render.batch_medium import AirColumn
 from weather_aug.render.batch_project import project
 from weather_aug.render.batch_splat import splat
 
-VACUUM = AirColumn(0.0, 0.0, 0.0, 0.0, torch.zeros(2), 1.0, (0.0, -1.0, 0.0))
+VACUUM = AirColumn(0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 3.0, torch.zeros(2), (0.0, -1.0, 0.0))
 WHITE, BLACK = torch.ones(3), torch.zeros(3)
 
 
+def records_of(discs):
+    """(N, 13) records of (N, 7) position, velocity, diameter: solid round discs."""
+    records = np.zeros((len(discs), 13), np.float32)
+    records[:, :6] = discs[:, :6]
+    records[:, [6, 9, 11]] = discs[:, 6:] ** 2 / 8
+    records[:, 12] = 1
+    return records
+
+
 def discs(count, seed=0):
-    """(N, 7) position, velocity, diameter in front of the default camera."""
+    """(N, 13) records of discs in front of the default camera."""
     rng = np.random.default_rng(seed)
     z = rng.uniform(0.6, 12, count)
     x, y = (rng.uniform(-0.7, 0.7, (2, count))) * z
     velocity = rng.normal(0, 4, (3, count))
     diameter = rng.uniform(0.002, 0.02, count)
-    return np.stack([x, y, z, *velocity, diameter], axis=1).astype(np.float32)
+    return records_of(np.stack([x, y, z, *velocity, diameter], axis=1))
 
 
 def projected(particles, camera, **kwargs):
-    records = torch.from_numpy(_records_of_discs(particles))
+    records = torch.from_numpy(particles)
     return project(records, camera, VACUUM, WHITE, BLACK, **kwargs).far_to_near()
 
 
@@ -40,16 +48,11 @@ def surfaces(camera, seed=1):
 
 
 @pytest.mark.parametrize("motion", [(0.0, 0, 0), (0.3, -1.0, 0.5)])
-def test_agrees_with_the_slow_reference(motion, monkeypatch):
-    rows = _records_of_discs(discs(150))
-    if not hasattr(reference, "gaussians"):
-        # MERGE: drop this once the reference takes records and cuts streaks, as from 36ce008 on.
-        monkeypatch.setattr(batch_project, "LONG_SWEEP_PX", float("inf"))
-        rows = discs(150)
+def test_agrees_with_the_slow_reference(motion):
     camera = make_camera(angular_velocity_rad_per_s=np.array(motion))
     particles, depth = discs(150), surfaces(camera)
     light, through = np.zeros((96, 160, 3)), np.ones((96, 160))
-    scene = (rows.astype(float), camera, lambda _: np.ones(3))
+    scene = (particles.astype(float), camera, lambda _: np.ones(3))
     reference.splat(light, through, depth, *scene)
     layer = splat(projected(particles, camera), torch.from_numpy(depth))
     assert through.min() < 0.7
@@ -68,7 +71,7 @@ def test_nearer_particles_cover_farther_ones():
     far = np.array([[0, 0, 6.0, 0, 0, 0, 1.5]], np.float32)
     red, blue = torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 0, 1.0])
     parts = [
-        project(torch.from_numpy(_records_of_discs(rows)), camera, VACUUM, colour, BLACK)
+        project(torch.from_numpy(records_of(rows)), camera, VACUUM, colour, BLACK)
         for rows, colour in ((near, red), (far, blue))
     ]
     depth = torch.full((96, 160), torch.inf)
@@ -95,8 +98,8 @@ def test_memory_bounds_do_not_change_the_picture():
 
 def test_no_splats_leave_the_picture_alone():
     camera = make_camera()
-    behind = np.array([[50.0, 0, 1.0, 0, 0, 0, 0.01]], np.float32)
-    layer = splat(projected(behind, camera), torch.from_numpy(surfaces(camera)))
+    aside = records_of(np.array([[50.0, 0, 1.0, 0, 0, 0, 0.01]], np.float32))
+    layer = splat(projected(aside, camera), torch.from_numpy(surfaces(camera)))
     assert (layer.through == 1).all()
     assert (layer.light == 0).all()
 
@@ -122,7 +125,7 @@ def test_a_general_covariance_is_that_of_projected_points():
 def streak(camera, sweep_px):
     """(1, 13) record of a disc of 8 mm at 1 m that sweeps to the right, and its width in pixels."""
     speed = sweep_px / camera.exposure_s / camera.focal_px[0]
-    record = _records_of_discs(np.array([[0, 0, 1, speed, 0, 0, 0.008]], np.float32))
+    record = records_of(np.array([[0, 0, 1, speed, 0, 0, 0.008]], np.float32))
     return torch.from_numpy(record), 0.008 / np.sqrt(8) * camera.focal_px[0]
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from weather_aug.clip.types import Camera
 from weather_aug.render.batch_medium import AirColumn
-from weather_aug.render.project import FAINTEST
+from weather_aug.render.project import FAINTEST, MOST_PARTS
 
 PIXEL_FILTER_PX2 = 0.3
 MOST_OPAQUE = 0.99
@@ -27,7 +27,6 @@ WHOLE_SPREAD = 1.0 / 12.0
 """Variance of a uniform sweep of length one."""
 PART_SPREAD = 0.2
 """Of a part, which overlaps its neighbours so that their sum does not ripple."""
-MOST_PARTS = 16
 LARGE_SHARE = 1e-3
 """A footprint of more than this share of the picture can hide a surface."""
 
@@ -116,26 +115,22 @@ def project(
     a0, b0, c0 = _sharp_covariance(rows[:, 6:12], tx, ty, sx, sy)
     defocus = camera.aperture_m * fx * (1.0 / z - 1.0 / FOCUS_M)
     soft = PIXEL_FILTER_PX2 + defocus * defocus / 16.0
-    whole = torch.arange(len(rows), device=rows.device)
-    parts = _part_counts(torch.hypot(qx, qy), 0.5 * (a0 + c0) + soft)
-    i = torch.repeat_interleave(whole, parts)
-    first = torch.cumsum(parts, 0) - parts
-    place = (torch.arange(len(i), device=i.device) - first[i] + 0.5) / parts[i] - 0.5
-    px, py = qx[i] / parts[i], qy[i] / parts[i]
-    spread = torch.where(parts == 1, WHOLE_SPREAD, PART_SPREAD)[i]
+    i, parts, place = _cut(_part_counts(torch.hypot(qx, qy), 0.5 * (a0 + c0) + soft))
+    px, py = qx[i] / parts, qy[i] / parts
+    spread = torch.where(parts == 1, WHOLE_SPREAD, PART_SPREAD)
     a = a0[i] + spread * px * px + soft[i]
     b = b0[i] + spread * px * py
     c = c0[i] + spread * py * py + soft[i]
     det = a * c - b * b
     det_sharp = (a0 * c0 - b0 * b0).clamp(min=0.0)[i]
     fainter = torch.sqrt(det_sharp / det) if compensate else torch.ones_like(det)
-    peak = (rows[i, 12] * fainter / parts[i] + FAINTEST).clamp(max=MOST_OPAQUE)
+    peak = (rows[i, 12] * fainter / parts + FAINTEST).clamp(max=MOST_OPAQUE)
     reach2 = 2.0 * torch.log(peak / FAINTEST)
     u, v = cx + fx * tx[i] + qx[i] * place, cy + fy * ty[i] + qy[i] * place
     half = torch.sqrt(reach2.clamp(min=0.0)[:, None] * torch.stack([a, c], dim=1))
     seen = (reach2 > 0.0) & _touches(u, v, half, camera)
     through = torch.exp(-air.optical_depth(z, tx, ty))[i, None]
-    area_px2 = torch.pi * reach2 * torch.sqrt(det) * parts[i]
+    area_px2 = torch.pi * reach2 * torch.sqrt(det) * parts
     splats = Splats(
         u=u.float(),
         v=v.float(),
@@ -179,6 +174,15 @@ def _part_counts(sweep_px: Tensor, variance_px2: Tensor) -> Tensor:
     parts = torch.ceil(sweep_px / (SWEEP_PER_PART * width)).clamp(1, MOST_PARTS)
     long = (sweep_px > LONG_SWEEP_PX) & (width > WIDE_STREAK_PX)
     return torch.where(long, parts, torch.ones_like(parts)).long()
+
+
+def _cut(counts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of each part: its particle, into how many that is cut, and its place from -1/2 to 1/2."""
+    whole = torch.arange(len(counts), device=counts.device)
+    particle = torch.repeat_interleave(whole, counts)
+    parts, first = counts[particle], (torch.cumsum(counts, 0) - counts)[particle]
+    place = torch.arange(len(particle), device=counts.device) - first
+    return particle, parts, (place + 0.5) / parts - 0.5
 
 
 def _touches(u: Tensor, v: Tensor, half: Tensor, camera: Camera) -> Tensor:

@@ -61,9 +61,10 @@ def toned_light(
 def _decoded(image: Tensor, curve: Tensor) -> Tensor:
     level = image * 255.0
     below = level.detach().floor().clamp(max=254.0)
-    index = below.long()
-    dark = curve[index]
-    return dark + (level - below) * (curve[index + 1] - dark)
+    index = below.flatten().int()
+    dark = curve.index_select(0, index).view_as(level)
+    slope = curve.diff().index_select(0, index).view_as(level)
+    return torch.addcmul(dark, level - below, slope)
 
 
 def veiled(light: Tensor, through: Tensor, airlight: Tensor) -> Tensor:
@@ -81,10 +82,14 @@ def encoded(light: Tensor) -> Tensor:
 
 def neighbourhood(mask: Tensor) -> Tensor:
     """(H, W) bool: true where the mask is within 7 x 7 pixels."""
-    size, rim = NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX // 2
-    grown = functional.max_pool2d(mask.float()[None, None], (1, size), stride=1, padding=(0, rim))
-    grown = functional.max_pool2d(grown, (size, 1), stride=1, padding=(rim, 0))
-    return grown[0, 0] > 0.0
+    rim = NEIGHBOURHOOD_PX // 2
+    grown = functional.pad(mask, (rim, rim, rim, rim))
+    for side in (0, 1):
+        # Windows of 2, 4 and 7 pixels, each the union of two of the ones before.
+        for step in (1, 2, NEIGHBOURHOOD_PX - 4):
+            count = grown.shape[side] - step
+            grown = grown.narrow(side, 0, count) | grown.narrow(side, step, count)
+    return grown
 
 
 def readable(

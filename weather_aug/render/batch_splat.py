@@ -17,8 +17,8 @@ from torch import Tensor
 
 from weather_aug.render.batch_project import Splats
 
-FRAGMENTS_AT_ONCE = 2**20
-"""Fragments in memory at once, about 200 bytes each."""
+FRAGMENTS_AT_ONCE = {"cpu": 2**16, "cuda": 2**20}
+"""Fragments in memory at once, about 200 bytes each; few on a CPU, for its cache."""
 NEAR_EDGE_M = 0.1
 """A particle fades out from this far in front of a surface to as far behind it."""
 HIDING_ALPHA = 0.5
@@ -41,6 +41,10 @@ class Layer:
         """The layer in front of linear light (3, H, W)."""
         return self.light.to(light.dtype) + self.through.to(light.dtype) * light
 
+    def rows(self, rows: slice) -> Layer:
+        """A view of some rows of the picture."""
+        return Layer(self.light[:, rows], self.through[rows], self.covered[rows])
+
 
 def empty_layer(depth_m: Tensor) -> Layer:
     """A layer of no particles for a picture (H, W), on the depth's device."""
@@ -58,7 +62,7 @@ def splat(
     depth_m: Tensor,
     *,
     behind: Layer | None = None,
-    fragments_at_once: int = FRAGMENTS_AT_ONCE,
+    fragments_at_once: int | None = None,
 ) -> Layer:
     """Draw splats, given far to near, in front of surfaces at `depth_m`.
 
@@ -67,18 +71,20 @@ def splat(
         depth_m: (H, W) float32 depth of the surfaces, `inf` for the sky.
         behind: A layer to draw in front of.
         fragments_at_once: Bounds the memory; the picture does not depend on it but for rounding
-            between the parts. At least one row of one splat is drawn at a time.
+            between the parts. At least one row of one splat is drawn at a time. Chosen for the
+            device if None.
 
     Returns:
         A new layer, with exact order per pixel; bits are the same in every run on a device.
     """
+    at_once = fragments_at_once or FRAGMENTS_AT_ONCE[depth_m.device.type]
     layer = empty_layer(depth_m) if behind is None else behind
     canvas = Layer(layer.light.clone(), layer.through.clone(), layer.covered.clone())
     height, width = depth_m.shape
     rows_of = _row_counts(splats, height)
-    for start, stop in _chunks(rows_of, fragments_at_once):
+    for start, stop in _chunks(rows_of, at_once):
         rows = _Rows.of(splats, start, rows_of[start:stop], width)
-        for first, last in _chunks(rows.length, fragments_at_once):
+        for first, last in _chunks(rows.length, at_once):
             _composite(rows.cut(first, last), splats, depth_m, canvas)
     return canvas
 

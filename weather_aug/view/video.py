@@ -214,15 +214,14 @@ def write_video(path: Path, frames: Iterable[UInt8], fps: float) -> int:
     """
     fps = finite("fps", fps, *FPS)
     check_video_path(path)
+    frames = _of_one_size(frames)
     if path.suffix.lower() == ".mp4":
         with _files.reported(path):
             path.parent.mkdir(parents=True, exist_ok=True)
         return _write_mp4(path, frames, fps)
     count = 0
     for count, image in enumerate(frames, start=1):
-        write_png(path / f"{count - 1:06d}.png", image_uint8("frame", image))
-    if not count:
-        raise ArgumentError("a video needs at least one frame")
+        write_png(path / f"{count - 1:06d}.png", image)
     return count
 
 
@@ -265,36 +264,40 @@ def _write_mp4(path: Path, frames: Iterable[UInt8], fps: float) -> int:
     return count
 
 
+def _of_one_size(frames: Iterable[UInt8]) -> Iterator[UInt8]:
+    """The frames, at least one, each of the size of the first; or an error that says which not."""
+    first: tuple[int, ...] = ()
+    for index, image in enumerate(frames):
+        image = image_uint8(f"frame {index}", image)
+        first = first or image.shape
+        if image.shape != first:
+            raise ArgumentError(
+                f"frame {index} is {image.shape[0]}x{image.shape[1]}, the first is "
+                f"{first[0]}x{first[1]}; a video has one size"
+            )
+        yield image
+    if not first:
+        raise ArgumentError("a video needs at least one frame")
+
+
 def _encode(draft: Path, frames: Iterable[UInt8], fps: float) -> int:
+    """Write frames without their odd last row or column; return how many were handed over."""
     writer: Any = None
-    size = (0, 0)
     count = 0
     try:
-        for image in frames:
-            image = image_uint8("frame", image)
-            if writer is None:
-                size = image.shape[:2]
-                writer = _opened(draft, size, fps)
-            if image.shape[:2] != size:
-                raise ArgumentError(
-                    f"frame {count} is {image.shape[0]}x{image.shape[1]}, the first is "
-                    f"{size[0]}x{size[1]}; a video has one size"
-                )
-            height, width = size[0] // 2 * 2, size[1] // 2 * 2
+        for count, image in enumerate(frames, start=1):
+            height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
+            writer = writer or _opened(draft, width, height, fps)
             writer.write(cv2.cvtColor(image[:height, :width], cv2.COLOR_RGB2BGR))
-            count += 1
     finally:
         if writer is not None:
             writer.release()
-    if not count:
-        raise ArgumentError("a video needs at least one frame")
     return count
 
 
-def _opened(draft: Path, size: tuple[int, int], fps: float) -> Any:
-    height, width = size[0] // 2 * 2, size[1] // 2 * 2
-    if not height or not width:
-        raise ArgumentError(f"a video needs pictures of 2x2 pixels or more, got {size}")
+def _opened(draft: Path, width: int, height: int, fps: float) -> Any:
+    if not width or not height:
+        raise ArgumentError("a video needs pictures of 2x2 pixels or more")
     code = cv2.VideoWriter.fourcc(*"mp4v")
     writer = cv2.VideoWriter(str(draft), cv2.CAP_FFMPEG, code, fps, (width, height))
     if not writer.isOpened():

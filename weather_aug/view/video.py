@@ -285,10 +285,11 @@ def _encode(draft: Path, frames: Iterable[UInt8], fps: float) -> int:
     writer: Any = None
     count = 0
     try:
-        for count, image in enumerate(frames, start=1):
+        for image in frames:
             height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
             writer = writer or _opened(draft, width, height, fps)
             writer.write(cv2.cvtColor(image[:height, :width], cv2.COLOR_RGB2BGR))
+            count += 1
     finally:
         if writer is not None:
             writer.release()

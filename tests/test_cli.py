@@ -12,12 +12,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from tiny_clip import digests_of
 
 import weather_aug
 from weather_aug.cli import Export, main, parsed_types
+from weather_aug.clip.types import FrameKey
 from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.scene.scene import WeatherScene
+from weather_aug.timeline import WeatherTimeline
+from weather_aug.view.video import drive_frames, parked_frames
 from weather_aug.weather import Weather
 
 STREET = "street:?frames=1&width=64&height=40"
@@ -105,6 +109,91 @@ def test_render_writes_invalid_masks_without_labels(
     shot = unlabelled_scene.render(unlabelled_scene.keys[0], Weather.fog("heavy"))
     invalid = cv2.imread(str(out / f"{keys[0]}_invIds.png"), cv2.IMREAD_UNCHANGED)
     assert np.array_equal(invalid, shot.invalid)
+
+
+def frames_in(folder: Path) -> list[NDArray[np.uint8]]:
+    """Pictures of a folder, RGB, by name."""
+    return [cv2.imread(str(p), cv2.IMREAD_COLOR_RGB) for p in sorted(folder.iterdir())]
+
+
+def test_render_makes_a_video_of_a_drive(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first camera at the clip's own rate; without loss the frames are those of the scene."""
+    path = tmp_path / "new" / "snow.mp4"
+    main([*f"render {folder} --weather snow --seed 3 --video {path}".split()])
+    assert capsys.readouterr().out == f"4 frames at 10 per second in {path}\n"
+    reader = cv2.VideoCapture(str(path))
+    assert reader.get(cv2.CAP_PROP_FRAME_COUNT) == 4
+    assert reader.get(cv2.CAP_PROP_FPS) == 10
+
+    out = tmp_path / "frames"
+    main([*f"render {folder} --weather snow --camera right --fps 5 --video {out}".split()])
+    assert capsys.readouterr().out == f"4 frames at 5 per second in {out}\n"
+    scene = WeatherScene.load(folder)
+    expected = drive_frames(scene, "right", Weather.snow("heavy"))
+    for image, frame in zip(frames_in(out), expected, strict=True):
+        assert np.array_equal(image, frame)
+
+
+def test_render_parks_the_car_in_a_changing_weather(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Unless told otherwise the change takes the whole video, of the clip's middle frame."""
+    scene = WeatherScene.load(folder)
+    parked = f"render {folder} --from clear --parked-s 0.4 --fps 20"
+    snow = Weather.snow("light")
+    for options, key, times_s in (
+        ("", FrameKey(2, "front"), (0.2, 0.6)),
+        (" --time 1 --start-s 0.15 --end-s 0.2", FrameKey(1, "front"), (0.15, 0.2)),
+    ):
+        out = tmp_path / f"parked{len(options)}"
+        main(f"{parked}{options} --weather snow --severity light --video {out}".split())
+        assert capsys.readouterr().out == f"8 frames at 20 per second in {out}\n"
+        change = WeatherTimeline.transition(Weather.clear(), snow, *times_s)
+        frames = frames_in(out)
+        expected = list(parked_frames(scene, key, change, fps=20, duration_s=0.4))
+        assert np.array_equal(frames[0], scene.frame(key).image)
+        assert all(np.array_equal(a, b) for a, b in zip(frames, expected, strict=True))
+
+
+@pytest.mark.parametrize("video", [True, False], ids=["video", "pictures"])
+def test_render_takes_a_timeline(folder: Path, tmp_path: Path, video: bool) -> None:
+    shower = WeatherTimeline.transition(Weather.clear(), Weather.rain("heavy"), 0.05, 0.15)
+    file, out = tmp_path / "shower.json", tmp_path / "out"
+    file.write_text(shower.to_json())
+    where = "--video" if video else "--out"
+    main([*f"render {folder} --timeline {file} --camera front {where} {out}".split()])
+    scene = WeatherScene.load(folder)
+    for image, frame in zip(frames_in(out), drive_frames(scene, "front", shower), strict=True):
+        assert np.array_equal(image, frame)
+
+
+def test_a_file_that_is_no_timeline_is_exit_code_3(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, out = tmp_path / "weather.json", tmp_path / "new"
+    for text, says in (("{", "not valid JSON"), ('{"knots": []}', "at least one"), ("[]", "list")):
+        file.write_text(text)
+        code, line = refused(f"render {folder} --timeline {file} --out {out}".split(), capsys)
+        assert (code, "weather.json" in line, says in line) == (3, True, True), line
+    code, line = refused(f"render {folder} --timeline {tmp_path}/no.json".split(), capsys)
+    assert (code, "no.json" in line) == (3, True)
+    assert not out.exists()
+
+
+def test_a_video_in_the_way_is_refused_before_any_work(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.txt").write_text("mine")
+    code, line = refused(f"render {folder} --video {tmp_path / 'full'}".split(), capsys)
+    assert (code, "not empty" in line) == (5, True)
+    code, line = refused(f"render {folder} --video {tmp_path / 'full/thesis.txt'}".split(), capsys)
+    assert (code, "ends with .mp4" in line) == (2, True)
+    (tmp_path / "file").write_text("mine")
+    code, line = refused(f"render {folder} --video {tmp_path / 'file' / 'a.mp4'}".split(), capsys)
+    assert (code, "cannot write" in line) == (6, True)
 
 
 def test_export_takes_weights_of_types(
@@ -195,6 +284,7 @@ def test_a_build_goes_on_after_an_interruption(
     [
         ("export {scene} --out {new}", "interrupted; run the same command again to continue"),
         ("render {scene} --out {new}", "interrupted"),
+        ("render {scene} --video {new}", "interrupted"),
         ("sweep {scene} --out {new}", "interrupted"),
         ("inspect {scene}", "interrupted"),
     ],
@@ -241,6 +331,29 @@ USAGE = {
     "fog that fell": ("render {scene} --out {new} --weather fog --no-falling", "--no-falling"),
     "clear that fell": ("render {scene} --out {new} --weather clear --no-falling", "--no-falling"),
     "unknown that fell": ("render {scene} --out {new} --weather hail --no-falling", "'hail'"),
+    "unknown first weather": ("render {scene} --out {new} --from hail", "weather type 'hail'"),
+    "a change that is none": (
+        "render {scene} --out {new} --from clear --start-s 2 --end-s 1",
+        "end_s must be after",
+    ),
+    "a start of nothing": ("render {scene} --out {new} --start-s 1", "--start-s needs --from"),
+    "a rate of pictures": ("render {scene} --out {new} --fps 5", "--fps needs --video"),
+    "parked pictures": ("render {scene} --out {new} --parked-s 5", "--parked-s needs --video"),
+    "a time to drive at": ("render {scene} --video {new} --time 1", "--time needs --parked-s"),
+    "a video in two places": ("render {scene} --video {new} --out b", "does not go with --out"),
+    "labels of a video": ("render {scene} --video {new} --labels", "does not go with --labels"),
+    "a timeline and a weather": (
+        "render {scene} --timeline a.json --weather snow --no-falling",
+        "--timeline does not go with --no-falling, --weather",
+    ),
+    "an odd film": ("render {scene} --video {new}.avi", "ends with .mp4"),
+    "a video without pace": ("render {scene} --video {new} --fps 0", "fps"),
+    "a video without camera": ("render {scene} --video {new} --camera rear", "no camera 'rear'"),
+    "a video without frame": (
+        "render {scene} --video {new} --parked-s 1 --time 99",
+        "no frame 000099_front",
+    ),
+    "a video without end": ("render {scene} --video {new} --parked-s 1e9", "duration_s"),
     "a type without weight": ("export {scene} --out {new} --types rain", "type=weight"),
     "a type without name": ("export {scene} --out {new} --types =1", "type=weight"),
     "a weight of words": ("export {scene} --out {new} --types rain=much", "'rain=much'"),

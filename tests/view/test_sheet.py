@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -15,7 +16,16 @@ from weather_aug.clip.types import FrameKey
 from weather_aug.errors import ArgumentError, OutputError
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.taxonomy import PALETTE, coloured
-from weather_aug.view.sheet import contact_sheet, grid, sweep, transmittance_picture, write_png
+from weather_aug.timeline import WeatherTimeline
+from weather_aug.view.sheet import (
+    contact_sheet,
+    grid,
+    left_to_right,
+    rig_still,
+    sweep,
+    transmittance_picture,
+    write_png,
+)
 from weather_aug.weather import Weather
 
 HEADER, MARGIN = 26, 4
@@ -149,6 +159,45 @@ def test_a_contact_sheet_without_labels_has_no_row_for_them(unlabelled_scene: We
     keys = unlabelled_scene.keys[:1]
     sheet = contact_sheet(unlabelled_scene, keys, severities=("heavy",), tile_width=64)
     assert sheet.shape[0] == HEADER + 2 * (48 + MARGIN)
+
+
+def test_a_rig_still_shows_all_cameras_of_a_moment(tiny_scene: WeatherScene) -> None:
+    weather = WeatherTimeline.transition(Weather.clear(), Weather.snow("heavy"), 0.1, 0.3)
+    sheet = rig_still(tiny_scene, 2, weather, seed=3, tile_width=64)
+    assert sheet.shape == (HEADER + 48 + MARGIN, HEADER + 2 * (64 + MARGIN), 3)
+    for column, camera in enumerate(("front", "right")):
+        expected = tiny_scene.render(FrameKey(2, camera), weather, seed=3).image
+        assert (tile(sheet, 0, column) == expected).all()
+    with pytest.raises(ArgumentError, match="it has 0 to 3"):
+        rig_still(tiny_scene, 4, weather)
+
+
+@pytest.mark.parametrize("heading_deg", [0, 100, 170, 190, 300])
+@pytest.mark.parametrize(
+    "yaws_deg",
+    [{"a": 0}, {"b": 50, "a": 0, "c": -50}, {"d": 110, "b": 55, "a": 0, "c": -55, "e": -110}],
+    ids=len,
+)
+def test_cameras_stand_from_left_to_right_wherever_the_street_leads(
+    yaws_deg: dict[str, float], heading_deg: float
+) -> None:
+    scene = Rig({name: np.radians(yaw + heading_deg) for name, yaw in yaws_deg.items()})
+    keys = [FrameKey(0, name) for name in sorted(yaws_deg)]
+    assert [key.camera for key in left_to_right(scene, keys)] == list(yaws_deg)  # type: ignore[arg-type]
+
+
+class Rig:
+    """Cameras that look along yaws (to the left, radians), as a scene's manifest tells of them."""
+
+    def __init__(self, yaws: dict[str, float]) -> None:
+        poses = {FrameKey(0, name): np.eye(4) for name in yaws}
+        for (_, name), pose in poses.items():
+            pose[:3, 2] = np.cos(yaws[name]), np.sin(yaws[name]), 0
+        cameras = {key: SimpleNamespace(world_from_camera=pose) for key, pose in poses.items()}
+        self.manifest = SimpleNamespace(
+            axes_world=np.eye(3),
+            by_key={key: SimpleNamespace(camera=camera) for key, camera in cameras.items()},
+        )
 
 
 def test_transmittance_rises_from_dark_to_bright() -> None:

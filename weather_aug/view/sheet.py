@@ -1,4 +1,4 @@
-"""Sheets of labelled pictures: severity sweeps and contact sheets."""
+"""Sheets of labelled pictures: severity sweeps, contact sheets, all cameras of a moment."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from weather_aug.render.compose import RenderedFrame
 from weather_aug.scene.policy import weather_of
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.taxonomy import coloured
+from weather_aug.timeline import WeatherTimeline
 from weather_aug.weather import Weather
 
 UInt8 = NDArray[np.uint8]
@@ -96,6 +97,58 @@ def contact_sheet(
         names.append("transmittance")
     columns = ["clear", *(f"{s} {kind}" for kind, s in states[1:])]
     return grid(rows, names, columns, tile_width)
+
+
+def rig_still(
+    scene: WeatherScene,
+    time_index: int,
+    weather: Weather | WeatherTimeline,
+    *,
+    seed: int = 0,
+    tile_width: int = 640,
+) -> UInt8:
+    """All cameras of a moment side by side, from left to right as they look.
+
+    Cameras of a rig see the same particles, so that a flake between two views stands in both.
+
+    Args:
+        scene: Scene to render from.
+        time_index: Which moment.
+        weather: State of air and ground, or how it changes with the time since the first frame.
+        seed: Of the particles.
+        tile_width: Width of each picture, pixels.
+
+    Returns:
+        (H, W, 3) uint8.
+
+    Raises:
+        ArgumentError: If the scene has no frame of this moment.
+    """
+    keys = [key for key in scene.keys if key.time_index == time_index]
+    if not keys:
+        raise ArgumentError(
+            f"scene {scene.name} has no frame at time index {time_index}; it has "
+            f"{scene.keys[0].time_index} to {scene.keys[-1].time_index}"
+        )
+    keys = left_to_right(scene, keys)
+    images = [scene.render(key, weather, seed=seed).image for key in keys]
+    return grid([images], [f"time {time_index}"], [key.camera for key in keys], tile_width)
+
+
+def left_to_right(scene: WeatherScene, keys: Sequence[FrameKey]) -> list[FrameKey]:
+    """Keys by where their cameras look, from left to right.
+
+    Headings lie on a circle, so the row is cut where two neighbours are farthest apart: behind a
+    rig that looks ahead, whichever way the street has turned.
+    """
+    along, left, _ = scene.manifest.axes_world
+    ahead = [scene.manifest.by_key[key].camera.world_from_camera[:3, 2] for key in keys]
+    yaws = np.array([np.arctan2(axis @ left, axis @ along) for axis in ahead])
+    order = np.argsort(-yaws, kind="stable")
+    gaps = (yaws[np.roll(order, 1)] - yaws[order]) % (2 * np.pi)
+    # Two cameras that look the same way have a gap of 0, one camera alone has no other.
+    first = int(np.argmax(gaps))
+    return [keys[i] for i in np.roll(order, -first)]
 
 
 def transmittance_picture(transmittance: NDArray[np.float32]) -> UInt8:

@@ -14,16 +14,16 @@ import tyro
 from tyro.conf import Positional
 
 from weather_aug import __version__, _files
+from weather_aug.cli.render import Render
+from weather_aug.cli.terminal import check_folder, complain, say, to_people
 from weather_aug.errors import (
     ArgumentError,
     DataError,
     IntegrityError,
-    OutputError,
     WeatherAugError,
     printable,
 )
 from weather_aug.taxonomy import IGNORE
-from weather_aug.weather import Weather, parse_severity
 
 DEMO_WIDTH_PX = (32, 4096)
 """Narrower, a picture of nine sixteenths its width has too few rows for the street."""
@@ -55,77 +55,10 @@ class Build:
             self.out,
             editor=self.editor,
             weathers=self.weathers,
-            progress=_to_people(),
+            progress=to_people(),
             overwrite=self.overwrite,
         )
-        _say(f"{len(scene.keys)} frames of {', '.join(scene.cameras)} in {self.out}")
-
-
-@dataclass(frozen=True)
-class Render:
-    """Render frames of a scene in one weather, as PNG files."""
-
-    scene: Positional[Path]
-    """Scene folder."""
-    weather: str = "rain"
-    """Weather type: clear, rain, snow, fog."""
-    severity: str = "heavy"
-    """light, moderate, heavy, extreme, or a number in [0, 1]."""
-    falling: bool = True
-    """Whether it rains or snows, or only did."""
-    out: Path = Path("out/render")
-    """Folder for the pictures."""
-    camera: str | None = None
-    """Only this camera."""
-    seed: int = 0
-    """Which particles fall."""
-    max_particles: int = 20_000
-    """Expected number of resolved particles in a picture at the most."""
-    labels: bool = False
-    """Write the invalid masks too, and the remapped labels where there are labels."""
-
-    def run(self) -> None:
-        """Render and name the folder."""
-        from tqdm.auto import tqdm
-
-        from weather_aug.render.options import RenderOptions
-        from weather_aug.scene.scene import WeatherScene
-        from weather_aug.view.sheet import write_png
-
-        weather = self._weather()
-        options = RenderOptions(self.max_particles)
-        _check_folder(self.out)
-        scene = WeatherScene.load(self.scene)
-        keys = [k for k in scene.keys if self.camera in (None, k.camera)]
-        if not keys:
-            raise ArgumentError(
-                f"scene {scene.name} has no camera {printable(self.camera)!r}; it has "
-                f"{', '.join(scene.cameras)}"
-            )
-        unlabelled = 0
-        for key in tqdm(keys, desc="render", unit="frame", disable=not _to_people()):
-            shot = scene.render(key, weather, seed=self.seed, options=options)
-            write_png(self.out / f"{key}.png", shot.image)
-            if self.labels:
-                write_png(self.out / f"{key}_invIds.png", shot.invalid)
-                if shot.label is not None:
-                    write_png(self.out / f"{key}_labelTrainIds.png", shot.label)
-            unlabelled += shot.label is None
-        _say(f"{len(keys)} pictures in {self.out}")
-        if self.labels and unlabelled:
-            _say(f"{unlabelled} of them have no label; only their invalid masks were written")
-
-    def _weather(self) -> Weather:
-        from weather_aug.scene.policy import weather_of
-
-        severity = parse_severity(_severity(self.severity))
-        weather = weather_of(self.weather, severity, falling=self.falling)
-        if not self.falling and self.weather not in ("rain", "snow"):
-            raise ArgumentError(
-                f"--no-falling is for rain and snow, which leave something behind; {self.weather} "
-                "does not fall"
-            )
-        return weather
+        say(f"{len(scene.keys)} frames of {', '.join(scene.cameras)} in {self.out}")
 
 
 @dataclass(frozen=True)
@@ -162,7 +95,7 @@ class Sweep:
         time_index = times[len(times) // 2] if self.time is None else self.time
         key = FrameKey(time_index, camera)
         write_png(self.out, sweep(scene, key, seed=self.seed, tile_width=self.tile_width))
-        _say(str(self.out))
+        say(str(self.out))
 
 
 @dataclass(frozen=True)
@@ -199,12 +132,12 @@ class Export:
         scenes = [WeatherScene.load(path) for path in self.scenes]
         plan = plan_export(scenes, policy, count=self.count, seed=self.seed)
         report = export(
-            plan, self.out, workers=self.workers, progress=_to_people(), verify=self.verify
+            plan, self.out, workers=self.workers, progress=to_people(), verify=self.verify
         )
-        _say(f"{report.samples} samples in {self.out}")
+        say(f"{report.samples} samples in {self.out}")
         unlabelled = report.samples - report.labelled
         if unlabelled:
-            _complain(f"warning: {unlabelled} of {report.samples} samples have no label")
+            complain(f"warning: {unlabelled} of {report.samples} samples have no label")
 
 
 @dataclass(frozen=True)
@@ -218,11 +151,11 @@ class Inspect:
         """Print the contents, then verify; damage ends with exit code 4."""
         problems, cure = _inspected(self.path)
         for problem in problems:
-            _say(problem)
+            say(problem)
         if problems:
             count = f"{len(problems)} problem{'s' if len(problems) > 1 else ''}"
             raise IntegrityError(f"{printable(self.path, 200)} is not whole ({count}); {cure}")
-        _say("every file is whole")
+        say("every file is whole")
 
 
 @dataclass(frozen=True)
@@ -249,24 +182,24 @@ class Demo:
             raise ArgumentError(f"width must be in [{low}, {high}] pixels, got {self.width}")
         height = self.width * 9 // 16
         clip = open_clip(f"street:?frames={self.frames}&width={self.width}&height={height}")
-        _check_folder(self.out)
-        _say("1/3 build a scene of the procedural street, three cameras (the first run compiles)")
+        check_folder(self.out)
+        say("1/3 build a scene of the procedural street, three cameras (the first run compiles)")
         with _files.reported(self.out):
             self.out.mkdir(parents=True, exist_ok=True)
-        scene = WeatherScene.build(clip, self.out / "scene", progress=_to_people(), overwrite=True)
-        _say("2/3 draw weather on the fly, as a training loop does")
+        scene = WeatherScene.build(clip, self.out / "scene", progress=to_people(), overwrite=True)
+        say("2/3 draw weather on the fly, as a training loop does")
         dataset = WeatherDataset([scene], seed=1)
         for index in range(0, len(dataset), max(1, len(dataset) // 3)):
             sample = dataset[index]
             ignored = (sample["label"] == IGNORE).float().mean()
-            _say(f"    {_state(sample['recipe'])}; {ignored:.1%} of the label ignored")
-        _say("3/3 render rain, snow and fog at three severities")
+            say(f"    {_state(sample['recipe'])}; {ignored:.1%} of the label ignored")
+        say("3/3 render rain, snow and fog at three severities")
         middle = scene.keys[len(scene.keys) // 2].time_index
         keys = [key for key in scene.keys if key.time_index == middle]
         sheet = self.out / "contact_sheet.png"
         write_png(sheet, contact_sheet(scene, keys))
-        _say(f"done in {time.perf_counter() - start:.0f} s; look at")
-        _say(str(sheet))
+        say(f"done in {time.perf_counter() - start:.0f} s; look at")
+        say(str(sheet))
 
 
 Command = (
@@ -283,7 +216,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run one command; an error is one line and an exit code (see `weather_aug.errors`)."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments == ["--version"]:
-        _say(f"weather-aug {__version__}")
+        say(f"weather-aug {__version__}")
         return
     command = tyro.cli(
         Command,
@@ -294,12 +227,12 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         command.run()
     except WeatherAugError as error:
-        _complain(str(error))
+        complain(str(error))
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
         goes_on = isinstance(command, Build | Export)
         cure = "; run the same command again to continue" if goes_on else ""
-        _complain(f"interrupted{cure}")
+        complain(f"interrupted{cure}")
         sys.exit(130)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -368,9 +301,9 @@ def _inspect_scene(path: Path) -> list[str]:
     manifest = scene.manifest
     labelled = sum("label" in record.files for record in manifest.frames)
     size_mib = sum(stored.size for stored in manifest.files.values()) / 2**20
-    _say(f"scene {scene.name}, digest {scene.digest[:12]}, editor {manifest.editor}")
-    _say(f"{len(scene.keys)} frames ({labelled} labelled) of {', '.join(scene.cameras)}")
-    _say(f"{len(manifest.files)} files, {size_mib:.1f} MiB")
+    say(f"scene {scene.name}, digest {scene.digest[:12]}, editor {manifest.editor}")
+    say(f"{len(scene.keys)} frames ({labelled} labelled) of {', '.join(scene.cameras)}")
+    say(f"{len(manifest.files)} files, {size_mib:.1f} MiB")
     return scene.damaged_files()
 
 
@@ -382,34 +315,3 @@ def _state(recipe: str) -> str:
         f"{name} {value:.3g}" for name, value in weather if isinstance(value, float) and value
     )
     return f"{sample['camera']} {sample['time_index']}: {state or 'clear'}"
-
-
-def _severity(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text
-
-
-def _check_folder(out: Path) -> None:
-    """Refuse an output folder that is a file, before any work is done for it."""
-    with _files.reported(out):
-        is_file = out.exists() and not out.is_dir()
-    if is_file:
-        raise OutputError(f"{printable(out, 200)} is a file; choose a folder for the pictures")
-
-
-def _complain(text: str) -> None:
-    print(f"weather-aug: {text}", file=sys.stderr)
-
-
-def _say(text: str) -> None:
-    print(text, flush=True)
-
-
-def _to_people() -> bool:
-    return sys.stderr.isatty()
-
-
-if __name__ == "__main__":
-    main()

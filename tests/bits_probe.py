@@ -1,22 +1,27 @@
 """Renders a set of cases and prints a digest of every plane; run in processes set up differently.
 
-`python tests/bits_probe.py [--cases A,B] [--threads N] [--save FILE]`. The inputs are made of
-integers and of operations that IEEE 754 fixes, so that they are equal on every machine.
+The inputs are made of integers and of operations that IEEE 754 fixes, so that they are equal on
+every machine.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import hashlib
 import json
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
+import cv2
 import numpy as np
 
 from weather_aug.clip.types import Camera, Frame, FrameKey
 from weather_aug.particles.shelter import Shelter
+from weather_aug.render import stage
 from weather_aug.render.compose import RenderedFrame, render
 from weather_aug.render.fields import RigMotion
 from weather_aug.render.light import ambience_of
@@ -111,9 +116,37 @@ def digests(names: list[str]) -> dict[str, str]:
     return found
 
 
+def canaries() -> dict[str, str]:
+    """Digests of what is known to depend on the CPU level."""
+    x = np.linspace(-20.0, 20.0, 20_001)
+    square = np.sin(np.arange(64.0 * 64.0)).reshape(64, 64)
+    values = {
+        "numpy exp": np.exp(x),
+        "numpy power": np.abs(x) ** 2.4,
+        "C exp": np.array([math.exp(v) for v in x]),
+        "BLAS product": square @ square,
+        "OpenCV blur": cv2.GaussianBlur(square, (0, 0), 2.0),
+    }
+    return {name: hashlib.sha256(value.tobytes()).hexdigest() for name, value in values.items()}
+
+
+@contextlib.contextmanager
+def fault() -> Iterator[None]:
+    """Let numpy's exp, whose last bit depends on the CPU, draw every pixel's depth."""
+    whole = stage.Stage._run
+
+    def faulty(self: stage.Stage, *arguments: Any) -> stage.Planes:
+        logarithm = np.log(np.minimum(self.depth, 1e4).astype(np.float64))
+        jittered = (np.exp(logarithm) * 2.0**45 % 1.0).astype(np.float32) + self.depth
+        object.__setattr__(self, "depth", jittered)
+        return whole(self, *arguments)
+
+    with mock.patch.object(stage.Stage, "_run", faulty):
+        yield
+
+
 def set_threads(count: int) -> None:
     """Of the libraries that have a call for it; the others read the environment."""
-    import cv2
     import numba
     import torch
 
@@ -123,10 +156,11 @@ def set_threads(count: int) -> None:
 
 
 def main() -> None:
-    """Print the digests as JSON."""
+    """Print digests of planes and canaries as JSON."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--cases", default=",".join(CASES))
     parser.add_argument("--threads", type=int)
+    parser.add_argument("--fault", action="store_true")
     parser.add_argument("--save", type=Path)
     arguments = parser.parse_args()
     names = arguments.cases.split(",")
@@ -134,9 +168,11 @@ def main() -> None:
         set_threads(arguments.threads)
     if arguments.save:
         shots = {name: rendered(name) for name in names}
-        planes = {f"{n}/{p}": getattr(s, p) for n, s in shots.items() for p in PLANES}
-        np.savez(arguments.save, **planes)
-    print(json.dumps(digests(names)))  # noqa: T201
+        saved = {f"{n}/{p}": getattr(s, p) for n, s in shots.items() for p in PLANES}
+        np.savez(arguments.save, **saved)
+    with fault() if arguments.fault else contextlib.nullcontext():
+        planes = digests(names)
+    print(json.dumps({"planes": planes, "canaries": canaries()}))  # noqa: T201
 
 
 if __name__ == "__main__":

@@ -93,7 +93,7 @@ class CheckedFiles:
         # Its owner alone may read what mkstemp makes.
         handle, name = tempfile.mkstemp(prefix=path.name, suffix=".tmp", dir=path.parent)
         try:
-            with open(handle, "wb") as file:
+            with os.fdopen(handle, "wb") as file:
                 file.write(self._digest(data) + data)
             Path(name).replace(path)
         except BaseException:

@@ -1,8 +1,10 @@
 """How loops are compiled here: one decorator, so that all kernels keep the same promises.
 
 Serial and without fast-math, so that bits do not depend on threads or on how far the compiler
-reassociates; without the interpreter lock. Division follows IEEE 754 (no ZeroDivisionError),
-because the check would keep loops from being vectorised.
+reassociates; without the interpreter lock. Going without fast-math costs little: on a CPU with
+AVX-512 a frame of even fog, of fog with rain and of snow was slower with it by 8 to 11 %, one of
+uneven fog faster by 4 %, and up to one value in 100,000 changed by a level. Division follows IEEE
+754 (no ZeroDivisionError), because the check would keep loops from being vectorised.
 
 The machine code is cached on disk where a folder can be written: in NUMBA_CACHE_DIR if it is set,
 else in `__pycache__` beside the source, else in the user's cache folder; never in a place that all

@@ -108,7 +108,7 @@ def rain(rate_mm_per_h: float, *, fall_speed: str = "brandes") -> Population:
     return Population(
         kind="rain",
         density_per_m3=density,
-        diameters_m=_settled(diameters_mm * 1e-3),
+        diameters_m=diameters_mm * 1e-3,
         fall_speed_m_per_s=_settled(FALL_SPEEDS[fall_speed](middle_mm)),
         cell_m=RAIN_CELL_M,
         sway_rad_per_s=sway_rad_per_s,
@@ -143,7 +143,7 @@ def snow(rate_mm_per_h: float, wetness: float = 0.0) -> Population:
     return Population(
         kind="snow",
         density_per_m3=density,
-        diameters_m=_settled(flake_diameter_mm(melted_mm, wetness) * 1e-3),
+        diameters_m=flake_diameter_mm(melted_mm, wetness) * 1e-3,
         fall_speed_m_per_s=_settled(0.8 * middle_mm**0.16),
         cell_m=SNOW_CELL_M,
         sway_rad_per_s=sway_rad_per_s,
@@ -222,12 +222,13 @@ def _classes(
     quantile = (np.arange(SIZES_PER_CLASS) + 0.5) / SIZES_PER_CLASS
     kept = -np.expm1(-slope_per_mm * (high - low))
     diameters = low - np.log1p(-quantile * kept) / slope_per_mm
-    return _settled(density), diameters
+    return density, diameters
 
 
-def _settled(values: Float64) -> Float64:
-    """`values` rounded to float32: the last bits of numpy's `exp` and `power` depend on the CPU.
+def _settled(fall_speed_m_per_s: Float64) -> Float64:
+    """Speeds rounded to float32.
 
-    A fall speed is multiplied by the time since the clip's start, which makes them larger.
+    The last bits of numpy's `exp` and `power` depend on the CPU, and the time since the clip's
+    start would multiply them.
     """
-    return values.astype(np.float32).astype(np.float64)
+    return fall_speed_m_per_s.astype(np.float32).astype(np.float64)

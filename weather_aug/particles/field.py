@@ -25,7 +25,14 @@ from weather_aug.air import Air
 from weather_aug.clip.types import Camera
 from weather_aug.errors import ArgumentError
 from weather_aug.particles import kernels
-from weather_aug.particles.resolve import FADE_SHARE, NEAR_FULL_M, NEAR_M, Resolved, resolve
+from weather_aug.particles.resolve import (
+    ARRIVAL_SHARE,
+    FADE_SHARE,
+    NEAR_FULL_M,
+    NEAR_M,
+    Resolved,
+    resolve,
+)
 from weather_aug.particles.statistics import Population
 from weather_aug.particles.tumble import shape_turns, shapes_in
 
@@ -111,7 +118,8 @@ class ParticleField:
         fade_per_m = (1.0 / (FADE_SHARE * np.maximum(reach_m, NEAR_M))).astype(np.float32)
         inputs = (
             _class_keys(population.kind, self.seed, len(pad_m)),
-            _counts(tuple(population.density_per_m3 * population.cell_m**3)),
+            _counts(tuple(population.mean_per_cell)),
+            ARRIVAL_SHARE,
             population.cell_m,
             field_from_camera[:3, 3] - self._carried_m(time_s),
             *_planes_and_bounds(turned, tangents, reach_m, pad_m, sway_m, population.cell_m),

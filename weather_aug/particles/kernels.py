@@ -221,19 +221,23 @@ def _turn(word, turns):
 
 
 @compiled
-def scatter(class_keys, counts, cell_m, origin_m, planes, bounds, view, motion, looks, out):
+def scatter(
+    class_keys, counts, arrival_share, cell_m, origin_m, planes, bounds, view, motion, looks, out
+):
     """Enumerate the particles that a camera can resolve, in camera axes.
 
     The particles of a class form an endless Poisson field that drifts rigidly: space, seen from the
     drifting frame, is cut into cubes, and the content of a cube is a hash of its index. How many
     particles a cube holds is a quantile of the Poisson distribution at the cube's own uniform
     number, and where the n-th of them is does not depend on how many there are: a higher density
-    adds particles and moves none.
+    adds particles and moves none. The last one of a cube is faint where the cube has only just got
+    it, so that none pops up while the density rises.
 
     Args:
         class_keys: (C,) uint64.
         counts: (C, K) uint64, the distribution function of the count of a cube times 2^64; the
             last is the largest word.
+        arrival_share: Share of the probability of a count over which its last particle appears.
         cell_m: (C,) side of a cube.
         origin_m: (C, 3) camera position minus the drift of the class, field axes, float64.
         planes: (C, 6, 4) planes of the padded view, field axes about the camera: normals point
@@ -255,7 +259,7 @@ def scatter(class_keys, counts, cell_m, origin_m, planes, bounds, view, motion, 
     left, right, top, bottom = view.tangents
     steepest = max(abs(left), abs(right), abs(top), abs(bottom))
     words = np.empty(BUFFER + counts.shape[1], np.uint64)
-    places = np.empty((BUFFER + counts.shape[1], 3))
+    places = np.empty((BUFFER + counts.shape[1], 4))
     limit = np.empty(sizes)
     for c in range(class_keys.shape[0]):
         if view.reach_m[c, sizes - 1] <= view.near_m:
@@ -298,7 +302,12 @@ def scatter(class_keys, counts, cell_m, origin_m, planes, bounds, view, motion, 
                     corner_y = r[1, 0] * px + r[1, 1] * py + r[1, 2] * pz
                     corner_z = r[2, 0] * px + r[2, 1] * py + r[2, 2] * pz
                     slot = key
-                    for _ in range(many):
+                    last = 1.0
+                    if many > 0:
+                        before = counts[c, many - 1]
+                        band = np.float64(counts[c, many] - before) * arrival_share
+                        last = min(np.float64(key - before) / band, 1.0)
+                    for n in range(many):
                         slot += GOLDEN
                         word = mix64(slot)
                         ux = np.float64(np.int64((word >> np.uint64(4)) & grid))
@@ -313,6 +322,7 @@ def scatter(class_keys, counts, cell_m, origin_m, planes, bounds, view, motion, 
                         passes &= (y >= top * z - wide) & (y <= bottom * z + wide)
                         words[fill] = word
                         places[fill, 0], places[fill, 1], places[fill, 2] = x, y, z
+                        places[fill, 3] = last if n == many - 1 else 1.0
                         fill += int(passes)
                     if fill >= BUFFER:
                         found = _record(c, words, places, fill, view, motion, looks, found, out)
@@ -367,7 +377,7 @@ def _record(c, words, places, fill, view, motion, looks, found, out):
                 _ball(square, row)
             leaving = (view.reach_m[c, q] - z) * view.fade_per_m[c, q]
             entering = (z - view.near_m) * per_near_m
-            row[12] = min(leaving, entering, 1.0)
+            row[12] = min(leaving, entering, 1.0) * places[i, 3]
         found += 1
     return found
 

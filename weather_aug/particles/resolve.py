@@ -2,8 +2,8 @@
 
 A particle is drawn where its pixel opacity is at least `alpha_min`; the rest of the population is a
 veil in closed form, so that the optical depth of both together is right at any particle budget.
-Drawn particles fade in behind the near limit and out before their reach, so that none pops up; the
-veil accounts for that too.
+Drawn particles fade in behind the near limit, out before their reach, and in when the density rises,
+so that none pops up; the veil accounts for that too.
 """
 
 from __future__ import annotations
@@ -24,6 +24,9 @@ NEAR_FULL_M = 0.7
 """The opacity of particles rises from 0 at the near limit to its full value here."""
 FADE_SHARE = 0.15
 """Share of its reach, at the end, over which the opacity of a particle falls to 0."""
+ARRIVAL_SHARE = 0.25
+"""Share of the probability of a count over which the last particle of a hash cell appears when the
+density rises: at any moment an eighth of the last particles' opacity is missing."""
 LEAST_REACH_M = NEAR_FULL_M / (1.0 - FADE_SHARE)
 """A size with a shorter reach is not drawn, so that the two fades never overlap."""
 FAR_M = 60.0
@@ -74,6 +77,7 @@ def resolve(
         np.shape(population.diameters_m),
         population.diameters_m.tobytes(),
         population.density_per_m3.tobytes(),
+        _drawn_share(population.mean_per_cell).tobytes(),
         np.ascontiguousarray(relative_m_per_s, np.float64).tobytes(),
         picture,
         camera.exposure_s,
@@ -86,6 +90,7 @@ def _resolved(
     shape: tuple[int, ...],
     diameters: bytes,
     density: bytes,
+    drawn_share: bytes,
     relative: bytes,
     picture: tuple[float, ...],
     exposure_s: float,
@@ -108,13 +113,25 @@ def _resolved(
         LEAST_REACH_M,
         FAR_M,
     )
+    opaque = per_size * np.frombuffer(drawn_share)
     optical_depth = kernels.resolved_optical_depth(
-        diameters_m, per_size, reach_m, NEAR_M, NEAR_FULL_M, FADE_SHARE, FAR_M, DEPTH_BINS
+        diameters_m, opaque, reach_m, NEAR_M, NEAR_FULL_M, FADE_SHARE, FAR_M, DEPTH_BINS
     )
     reach_m = reach_m.astype(np.float32)
     for array in (reach_m, optical_depth):
         array.flags.writeable = False
     return Resolved(alpha_min, reach_m, count, optical_depth)
+
+
+def _drawn_share(mean_per_cell: Float64) -> Float64:
+    """Share (C,) of the opacity that the last particles of the cells leave, on average.
+
+    A cell of n particles lacks half of `ARRIVAL_SHARE` if n > 0, which is so with probability
+    1 - exp(-mean).
+    """
+    mean = np.maximum(mean_per_cell, 1e-12)
+    share: Float64 = 1.0 + 0.5 * ARRIVAL_SHARE * np.expm1(-mean) / mean
+    return share
 
 
 def _across_picture(picture: tuple[float, ...], relative: Float64) -> Float64:

@@ -79,6 +79,12 @@ class Population:
     tumbles: bool = False
     """Whether the particles are tumbling ellipsoids; balls if not."""
 
+    @property
+    def mean_per_cell(self) -> Float64:
+        """(C,) expected particles of each class in one hash cell."""
+        mean: Float64 = self.density_per_m3 * self.cell_m**3
+        return mean
+
 
 def rain(rate_mm_per_h: float, *, fall_speed: str = "brandes") -> Population:
     """Raindrops after Marshall and Palmer (1948), falling after Brandes (2002) or Atlas (1973).
@@ -109,7 +115,7 @@ def rain(rate_mm_per_h: float, *, fall_speed: str = "brandes") -> Population:
         kind="rain",
         density_per_m3=density,
         diameters_m=diameters_mm * 1e-3,
-        fall_speed_m_per_s=FALL_SPEEDS[fall_speed](middle_mm),
+        fall_speed_m_per_s=_settled(FALL_SPEEDS[fall_speed](middle_mm)),
         cell_m=RAIN_CELL_M,
         sway_rad_per_s=sway_rad_per_s,
         sway_m=math.sqrt(2) * CALM_JITTER_M_PER_S / sway_rad_per_s,
@@ -144,7 +150,7 @@ def snow(rate_mm_per_h: float, wetness: float = 0.0) -> Population:
         kind="snow",
         density_per_m3=density,
         diameters_m=flake_diameter_mm(melted_mm, wetness) * 1e-3,
-        fall_speed_m_per_s=0.8 * middle_mm**0.16,
+        fall_speed_m_per_s=_settled(0.8 * middle_mm**0.16),
         cell_m=SNOW_CELL_M,
         sway_rad_per_s=sway_rad_per_s,
         sway_m=np.full_like(sway_rad_per_s, SNOW_SWAY_M * (1.0 - 0.5 * wetness)),
@@ -223,3 +229,12 @@ def _classes(
     kept = -np.expm1(-slope_per_mm * (high - low))
     diameters = low - np.log1p(-quantile * kept) / slope_per_mm
     return density, diameters
+
+
+def _settled(fall_speed_m_per_s: Float64) -> Float64:
+    """Speeds rounded to float32.
+
+    The last bits of numpy's `exp` and `power` depend on the CPU, and the time since the clip's
+    start would multiply them.
+    """
+    return fall_speed_m_per_s.astype(np.float32).astype(np.float64)

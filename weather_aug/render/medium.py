@@ -99,17 +99,15 @@ def layer_share(heights):
 def spray_share(heights, camera_heights):
     """Mean density along a ray that climbs by `heights` scale heights, over that at the road.
 
-    The layer is as dense below the road's plane as on it: a road that falls away, or noise in the
-    depth, must not run into a layer that grows without end.
+    There is no spray below the road's plane: a road that falls away, or noise in the depth, must
+    not run into a layer that grows without end.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     lowest = -camera_heights
-    at_camera = survival(camera_heights)
-    above = at_camera * layer_share(heights if heights > lowest else lowest)
-    deeper = heights if heights < lowest else lowest
-    under = one - lowest / (deeper if deeper < np.float32(-0.01) else np.float32(-0.01))
-    under = under if (heights < lowest) & (under > zero) else zero
-    return above + under * (one - above)
+    above = survival(camera_heights) * layer_share(heights if heights > lowest else lowest)
+    deeper = heights if heights < np.float32(-0.01) else np.float32(-0.01)
+    share = lowest / deeper
+    return above * (share if (heights < lowest) & (share > zero) else one)
 
 
 @inlined

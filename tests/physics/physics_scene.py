@@ -1,0 +1,95 @@
+"""Particles drawn alone, by the compiled kernels, for the checks of the physics."""
+
+import numpy as np
+
+from weather_aug.render.froxels import even_fog
+from weather_aug.render.medium import Medium
+from weather_aug.render.project import BAND_ROWS, project, sorted_in_blocks, split_by_band
+from weather_aug.render.shade import Tone, shade
+from weather_aug.render.stage import optics_of
+
+UP = np.array([0.0, 0, 1])
+CLEAR_AIR = Medium(*(np.float32(v) for v in (0, 0, 0, 0, 60 / 1024, 0, 3)))
+NOTHING_RESOLVED = np.zeros(1025, np.float32)
+FILTER_PX2 = 0.3
+FAINTEST = 1 / 255
+"""What a peak is raised by, against the cut of its footprint."""
+
+
+def solid(position, velocity, diameter_m, opacity=1.0):
+    """Records (N, 13) of balls; opacity scales the peak."""
+    position = np.atleast_2d(np.asarray(position, float))
+    records = np.zeros((len(position), 13), np.float32)
+    records[:, :3] = position
+    records[:, 3:6] = velocity
+    records[:, [6, 9, 11]] = (np.asarray(diameter_m, float).reshape(-1, 1)) ** 2 / 8
+    records[:, 12] = opacity
+    return records
+
+
+def splats_of_records(records, camera, colour=(1.0, 1.0, 1.0), *, compensate=True):
+    """(M, 16) Gaussians on the picture in clear air."""
+    blocks, kinds = sorted_in_blocks(np.asarray(records, np.float32), np.array([len(records)]))
+    return project(
+        blocks,
+        kinds,
+        np.array([colour], np.float32),
+        optics_of(camera, UP),
+        CLEAR_AIR,
+        NOTHING_RESOLVED,
+        np.ones(3, np.float32),
+        (0, 0, camera.height, camera.width),
+        compensate,
+    )
+
+
+def layer(splats, camera, level=0, depth_m=1000.0):
+    """Picture (H, W, 3) and transmittance (H, W) of splats over a uniform sRGB level."""
+    height, width = camera.height, camera.width
+    window = (0, 0, height, width)
+    splats, band_starts = split_by_band(splats, window, -(-height // BAND_ROWS))
+    through = np.empty((height, width), np.float32)
+    out = np.empty((3, height, width), np.uint8)
+    zero = np.float32(0)
+    srgb = np.arange(256) / 255
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    shade(
+        np.broadcast_to(np.asarray(level, np.uint8), (height, width, 3)).copy(),
+        np.full((height, width), depth_m, np.float32),
+        np.zeros((height, width), bool),
+        even_fog(),
+        window,
+        optics_of(camera, UP),
+        CLEAR_AIR,
+        NOTHING_RESOLVED,
+        linear.astype(np.float32),
+        np.eye(3, dtype=np.float32),
+        Tone(zero, np.float32(1), zero, zero),
+        np.ones(3, np.float32),
+        splats,
+        band_starts,
+        zero,
+        out,
+        through,
+        np.empty((height, width), np.uint8),
+        np.zeros((height, width), np.uint8),
+    )
+    return out.transpose(1, 2, 0), through
+
+
+def covariances(splats):
+    """(M, 2, 2) of the footprints, px^2, the pixel filter included."""
+    a, b, c = splats[:, 2:5].astype(float).T
+    conic = np.stack([np.stack([a, b], -1), np.stack([b, c], -1)], -2)
+    return np.linalg.inv(conic)
+
+
+def long_axes(splats):
+    """(M, 2) unit vectors along the streaks."""
+    return np.linalg.eigh(covariances(splats))[1][:, :, 1]
+
+
+def angle_deg(first, second):
+    """Angle between two lines, degrees in [0, 90]; arrays of (..., 2)."""
+    cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+    return np.degrees(np.abs(np.arctan2(cross, (first * second).sum(-1) + 0.0)) % np.pi)

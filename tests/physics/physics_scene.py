@@ -92,4 +92,4 @@ def long_axes(splats):
 def angle_deg(first, second):
     """Angle between two lines, degrees in [0, 90]; arrays of (..., 2)."""
     cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
-    return np.degrees(np.abs(np.arctan2(cross, (first * second).sum(-1) + 0.0)) % np.pi)
+    return np.degrees(np.arctan2(np.abs(cross), np.abs((first * second).sum(-1))))

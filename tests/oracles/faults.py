@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from weather_aug.air import Air, air_of
+
 
 def opacity_of_the_papers_fog(alpha, tau, z):
     """1 - exp(-beta d) for each Gaussian: what all the fog before it would take."""
@@ -93,3 +95,77 @@ def opacity_without_exposure(drawn):
         return splats
 
     return wrong
+
+
+def recycled_points(time_s, x, yaw_deg, count=20_000, step_s=0.1, speed_m_per_s=3.0):
+    """The paper's rule: what has left below starts again at the top, its overshoot forgotten."""
+    low, high = np.array([4.0, -1.6, -0.1]), np.array([7.2, 1.6, 3.1])
+    places = np.random.default_rng(1).uniform(low, high, (count, 3))
+    for _ in range(round(time_s / step_s)):
+        places[:, 2] -= speed_m_per_s * step_s
+        places[places[:, 2] < low[2], 2] = high[2] - 1e-9
+    return places
+
+
+class FieldOfAStream:
+    """Draws from one stream of random numbers, as numpy's global one: each call another field."""
+
+    def __init__(self, make_field, seed):
+        self.make_field, self.stream = make_field, np.random.default_rng(seed)
+
+    def particles(self, camera, time_s, kind):
+        return self.make_field(int(self.stream.integers(2**32))).particles(camera, time_s, kind)
+
+
+class FieldOfSteps:
+    """Moves on by a step with each frame that is asked for, whatever its time."""
+
+    def __init__(self, make_field, seed):
+        self.field, self.time_s = make_field(seed), 0.0
+
+    def particles(self, camera, time_s, kind):
+        found = self.field.particles(camera, self.time_s, kind)
+        self.time_s += 0.1
+        return found
+
+
+class FieldOfEachCamera:
+    """Seeds the field by the camera, so that each sees air of its own."""
+
+    def __init__(self, make_field, seed):
+        self.make_field, self.seed = make_field, seed
+
+    def particles(self, camera, time_s, kind):
+        own = abs(hash(camera.world_from_camera.tobytes())) % 2**32
+        return self.make_field(self.seed + own).particles(camera, time_s, kind)
+
+
+def wrapped(at, box_m=1.9):
+    """Particles that are wrapped in a box which the camera looks into."""
+
+    def wrong(weather, population, time_s):
+        camera, records = at(weather, population, time_s)
+        inside = records.copy()
+        inside[:, 1] = np.mod(records[:, 1], box_m) - 0.5 * box_m
+        return camera, inside
+
+    return wrong
+
+
+def air_of_wind_times_time(weather, time_s, seed):
+    """The drift of a changing wind as its value of now times the time."""
+    right = air_of(weather, time_s, seed)
+    return Air(right.wind_m_per_s, tuple(time_s * v for v in right.wind_m_per_s), right.wet_s)
+
+
+def pose_of_now(world_from_first, world_from_now):
+    """T_t^-1 for T_0 T_t^-1: a field carried from the world's origin."""
+    return np.linalg.inv(world_from_now)
+
+
+def turned_about_the_origin(world_from_first, world_from_now):
+    """The released code: R_t R_0^T about the world's origin, then C_t - C_0."""
+    motion = np.eye(4)
+    motion[:3, :3] = world_from_now[:3, :3] @ world_from_first[:3, :3].T
+    motion[:3, 3] = world_from_now[:3, 3] - world_from_first[:3, 3]
+    return np.linalg.inv(motion)

@@ -1,8 +1,12 @@
 """Planted faults: what others do wrong, or we might, each in the place of the right thing."""
 
+import zlib
+
 import numpy as np
+from oracles import reference_render as reference
 
 from weather_aug.air import Air, air_of
+from weather_aug.weather import Weather
 
 
 def opacity_of_the_papers_fog(alpha, tau, z):
@@ -136,7 +140,7 @@ class FieldOfEachCamera:
         self.make_field, self.seed = make_field, seed
 
     def particles(self, camera, time_s, kind):
-        own = abs(hash(camera.world_from_camera.tobytes())) % 2**32
+        own = zlib.crc32(camera.world_from_camera.tobytes())
         return self.make_field(self.seed + own).particles(camera, time_s, kind)
 
 
@@ -169,3 +173,96 @@ def turned_about_the_origin(world_from_first, world_from_now):
     motion[:3, :3] = world_from_now[:3, :3] @ world_from_first[:3, :3].T
     motion[:3, 3] = world_from_now[:3, 3] - world_from_first[:3, 3]
     return np.linalg.inv(motion)
+
+
+def seed_of_severity(severity):
+    """Another draw for each severity."""
+    return int(1e6 * severity)
+
+
+def dipping(weather_of):
+    """A scale with a dip of a hundredth between moderate and heavy."""
+    return lambda kind, s: weather_of(kind, s - 0.015 * (0.6 < s < 0.62))
+
+
+def grey(level_srgb):
+    """(3,) linear light of a fixed sRGB grey, in [0, 1]."""
+    return np.full(3, float(reference.linear(255 * level_srgb)))
+
+
+def _in_gamma(draw):
+    """Fog blended as the picture is stored, in sRGB."""
+
+    def wrong(frame, weather, ambience):
+        camera = frame.camera
+        slant = np.sqrt(1 + (reference.rays(camera) ** 2).sum(-1))
+        through = np.exp(-weather.fog_per_m * frame.depth_m * slant)[..., None]
+        veil = reference.srgb(ambience.airlight)
+        return reference.linear(through * frame.image + (1 - through) * veil)
+
+    return wrong
+
+
+def _quadratic(draw):
+    """The paper's fog: each Gaussian 1 - exp(-beta d) opaque, so that depth counts twice."""
+
+    def wrong(frame, weather, ambience):
+        camera = frame.camera
+        slant = np.sqrt(1 + (reference.rays(camera) ** 2).sum(-1))
+        path = frame.depth_m * slant
+        tau = weather.fog_per_m * path**2 / 40.0
+        through = np.exp(-tau)[..., None]
+        light = reference.linear(frame.image)
+        return through * light + (1 - through) * ambience.airlight
+
+    return wrong
+
+
+def _two_percent(draw):
+    """The visibility of Koschmieder's 2 % for that of 5 %."""
+
+    def wrong(frame, weather, ambience):
+        other = weather.visibility_m * np.log(0.05) / np.log(0.02)
+        return draw(frame, Weather(visibility_m=other), ambience)
+
+    return wrong
+
+
+FOGS = {"in gamma": _in_gamma, "quadratic": _quadratic, "two percent": _two_percent}
+
+
+def _even(form):
+    """Fog without a top."""
+    return lambda ray, depth_m, up, fog, height: form(ray, depth_m, up, fog, 1e12)
+
+
+def _density_of_the_surface(form):
+    """The fog where the surface is, along the whole ray."""
+
+    def wrong(ray, depth_m, up, fog, height):
+        rise = depth_m * (ray @ up[:2] + up[2])
+        return form(ray, depth_m, up, fog * np.exp(-rise / height), 1e12)
+
+    return wrong
+
+
+def _by_depth(form):
+    """Depth for range."""
+    return lambda ray, *args: form(ray, *args) / np.sqrt(1 + ray @ ray)
+
+
+LAYERS = {"even": _even, "surface": _density_of_the_surface, "by depth": _by_depth}
+
+
+def without_slant(kernel):
+    """Depth for range, in the kernel's place."""
+
+    def wrong(camera, *args):
+        return kernel(camera, *args) / np.sqrt(1 + (reference.rays(camera) ** 2).sum(-1))
+
+    return wrong
+
+
+def sky_at_80_m(camera, weather, ambience):
+    """The paper's fog ends with its box; behind it the sky is clear."""
+    return np.full((camera.height, camera.width), np.exp(-weather.fog_per_m * 80.0))

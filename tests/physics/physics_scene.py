@@ -1,5 +1,7 @@
 """Particles drawn alone, by the compiled kernels, for the checks of the physics."""
 
+import logging
+
 import numpy as np
 
 from weather_aug.render.froxels import even_fog
@@ -14,6 +16,11 @@ NOTHING_RESOLVED = np.zeros(1025, np.float32)
 FILTER_PX2 = 0.3
 FAINTEST = 1 / 255
 """What a peak is raised by, against the cut of its footprint."""
+
+
+def measured(text):
+    """Say what a check has measured; `pytest tests/physics --log-cli-level=INFO` shows it."""
+    logging.getLogger("physics").info(text)
 
 
 def solid(position, velocity, diameter_m, opacity=1.0):

@@ -7,7 +7,7 @@ import pytest
 from oracles import faults, size_laws
 from oracles import reference_render as reference
 from particles.particle_scene import camera, field
-from physics_scene import layer, solid, splats_of_records
+from physics_scene import layer, measured, solid, splats_of_records
 from render_scene import make_camera, make_frame
 
 from weather_aug.particles import resolve as resolving
@@ -63,7 +63,7 @@ def check_beer_lambert(opacity, tau, alpha, draws=4):
     variance = (1600 * 0.0125 / z) ** 2
     thinner = (variance / (variance + 0.3)).mean()
     expected = np.sqrt(np.expm1(tau * slant.mean() * alpha * thinner / 2))
-    print(f"1: tau {tau} alpha {alpha}: T {mean - 1:+.4f}, CV {scatter / expected - 1:+.4f}")
+    measured(f"1: tau {tau} alpha {alpha}: T {mean - 1:+.4f}, CV {scatter / expected - 1:+.4f}")
     assert abs(mean - 1) < 0.03
     assert abs(scatter / expected - 1) < 0.10
 
@@ -109,7 +109,7 @@ def check_explicit_and_residual(kind, budget, exposure_s=0.002, *, veil=veil, fa
         )
         total = size_laws.geometric_extinction_per_m(kind, rate) * depth_m
         error = (drawn + veil(population, resolved, depth_m)) / total - 1
-        print(f"3: {kind} {budget} {depth_m} m drawn {drawn / total:.3f} error {error:+.5f}")
+        measured(f"3: {kind} {budget} {depth_m} m drawn {drawn / total:.3f} error {error:+.5f}")
         assert drawn > 0.004 * total
         assert abs(error) < 0.01
     return resolved.alpha_min
@@ -162,7 +162,7 @@ def check_rendered_walls(ambience, depth_m, budgets, seeds):
             for seed in range(seeds)
         ]
         mean = np.mean([shot.transmittance.mean() for shot in shots])
-        print(f"3: rendered {depth_m} m {budget}: {mean / expected - 1:+.5f}")
+        measured(f"3: rendered {depth_m} m {budget}: {mean / expected - 1:+.5f}")
         assert abs(mean / expected - 1) < 0.01
 
 
@@ -200,7 +200,7 @@ def check_resolution(ambience, weather, seeds, tolerance=0.01):
             ]
         )
     spread = np.ptp(means, axis=0) / means[0]
-    print(f"4: T {spread[0]:.5f}, luminance {spread[1]:.5f}")
+    measured(f"4: T {spread[0]:.5f}, luminance {spread[1]:.5f}")
     assert (spread < tolerance).all()
 
 
@@ -225,7 +225,7 @@ def check_resolution_of_discs(*, compensate, tolerance=0.01):
     spread = np.ptp(means, axis=0) / means[0]
     slant = np.sqrt(1 + (reference.rays(full) ** 2).sum(-1))
     expected = np.exp(-tau * slant).mean()
-    print(f"4: {count} discs: spreads {spread}, T {means[0][0] / expected - 1:+.5f}")
+    measured(f"4: {count} discs: spreads {spread}, T {means[0][0] / expected - 1:+.5f}")
     assert (spread < tolerance).all()
     assert abs(means[0][0] / expected - 1) < 0.03
 

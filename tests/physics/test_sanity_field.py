@@ -7,7 +7,7 @@ import pytest
 import torch
 from oracles import faults
 from particles.particle_scene import camera, field, inside, nearest, whole, world
-from physics_scene import splats_of_records
+from physics_scene import measured, splats_of_records
 from render_scene import make_frame
 from scipy import stats
 
@@ -55,7 +55,7 @@ def check_stationary(points_of):
     low = np.array([4.0, -0.5 * SIDE_M, -0.1])
     for moment in MOMENTS:
         p = uniformity(points_of(*moment), low, SIDE_M)
-        print(f"7: at {moment}: p = {p:.3f}")
+        measured(f"7: at {moment}: p = {p:.3f}")
         assert p > 0.01
 
 
@@ -92,7 +92,7 @@ def check_no_repetition(ambience, places_of):
     layer -= layer.mean()
     lag = round(box_m / step_m)
     correlation = float((layer[lag:] * layer[:-lag]).mean() / layer.var())
-    print(f"7: autocorrelation {correlation:+.3f}")
+    measured(f"7: autocorrelation {correlation:+.3f}")
     assert correlation < 0.2
 
 
@@ -154,7 +154,7 @@ def check_two_cameras(make_field, kind="snow"):
             both &= before & inside(np.where(before[:, None], seen_as, (0, 0, -1.0)), eye)
         common.append(points[both])
     off = nearest(common[0], np.concatenate([common[1], np.full((1, 3), 1e3)]))
-    print(f"8: {kind} {len(common[0])} and {len(common[1])} common, {np.max(off):.1e} m apart")
+    measured(f"8: {kind} {len(common[0])} and {len(common[1])} common, {np.max(off):.1e} m apart")
     assert len(common[0]) > 20
     # At the rim of a picture a rounding may decide whether a particle is inside of both.
     assert abs(len(common[0]) - len(common[1])) <= 0.01 * len(common[0])
@@ -198,7 +198,7 @@ def check_torch_path(device, dtype=torch.float32, shifted=0.0):
     parts = batch_project.project(rows, cam, air, white, white)
     drawn = np.stack([parts.u.cpu().numpy(), parts.v.cpu().numpy()], axis=1).astype(float)
     off = nearest(blocks, drawn).max() / cam.focal_px[0]
-    print(f"8: {device} {len(blocks)} splats, {off:.1e} of a tangent apart")
+    measured(f"8: {device} {len(blocks)} splats, {off:.1e} of a tangent apart")
     assert len(blocks) == len(drawn)
     assert off < 1e-5
 
@@ -230,5 +230,3 @@ def test_8_rendered_frames_in_any_order(ambience):
     back = [shot(*one) for one in wanted[::-1]][::-1]
     for one, other in zip(forth, back, strict=True):
         np.testing.assert_array_equal(one, other)
-
-

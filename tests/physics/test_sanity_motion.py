@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from oracles import faults
 from particles.particle_scene import AXES, camera, inside, whole
+from physics_scene import measured
 from render_scene import make_frame
 from scipy.spatial import cKDTree
 
@@ -17,9 +18,7 @@ from weather_aug.render.fields import RigMotion
 from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
 
-GUSTY = Weather(
-    rain_mm_per_h=20.0, snow_mm_per_h=2.0, wind_m_per_s=(1.0, 3.0, 0.0), gustiness=0.3
-)
+GUSTY = Weather(rain_mm_per_h=20.0, snow_mm_per_h=2.0, wind_m_per_s=(1.0, 3.0, 0.0), gustiness=0.3)
 WETTER = replace(GUSTY, snow_wetness=0.5)
 POPULATIONS = {
     "rain": (GUSTY, statistics.rain(20.0)),
@@ -62,16 +61,14 @@ def check_continuity(weather, population, at=records_at, *, swaying=True):
         assert stays.sum() > 100
         worst = max(worst, off)
         assert off < tolerance_m
-    print(f"9: {len(before)} particles, off by {worst:.1e} m of {tolerance_m:.1e}")
+    measured(f"9: {len(before)} particles, off by {worst:.1e} m of {tolerance_m:.1e}")
 
 
 @pytest.mark.parametrize("swaying", [False, True])
 @pytest.mark.parametrize("kind", POPULATIONS)
 def test_9_continuity(kind, swaying):
     weather, population = POPULATIONS[kind]
-    check_continuity(
-        weather, population if swaying else held_still(population), swaying=swaying
-    )
+    check_continuity(weather, population if swaying else held_still(population), swaying=swaying)
 
 
 @pytest.mark.parametrize("kind", POPULATIONS)
@@ -131,7 +128,7 @@ def check_parked_modes_agree(motion_of, ambience):
         plain = places(population, PARKED, None)
         carried = places(population, PARKED, motion_of(pose, pose))
         assert plain.shape == carried.shape
-        print(f"10: parked off by {np.abs(plain - carried).max():.1e}")
+        measured(f"10: parked off by {np.abs(plain - carried).max():.1e}")
         assert np.abs(plain - carried).max() <= 1e-6
     frame = make_frame(PARKED, 60, 20.0, time_s=TIME_S)
     shots = [
@@ -146,7 +143,7 @@ def check_parked_modes_agree(motion_of, ambience):
         for alignment in ("world", "camera")
     ]
     worst = np.abs(shots[0].transmittance - shots[1].transmittance).max()
-    print(f"10: pictures off by {worst:.1e}")
+    measured(f"10: pictures off by {worst:.1e}")
     assert worst <= 1e-5
 
 
@@ -158,7 +155,7 @@ def check_driven_sees_parked(motion_of):
         parked = parked[inside(parked, PARKED)].astype(float)
         driven = places(population, DRIVEN, motion).astype(float)
         off = cKDTree(driven[:, :3]).query(parked[:, :3])[0]
-        print(f"10: {len(parked)} carried off by {off.max():.1e} m")
+        measured(f"10: {len(parked)} carried off by {off.max():.1e} m")
         assert off.max() < 1e-5
 
 

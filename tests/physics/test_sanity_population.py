@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from oracles import faults, size_laws
 from particles.particle_scene import camera, field, inside, seen
+from physics_scene import measured
 from scipy import stats
 
 from weather_aug.particles import statistics
@@ -26,7 +27,7 @@ def check_counts(kind, population, seeds=8):
         counted += int(inside(found, cam).sum())
         expected += size_laws.drawn_count(population, RATE[kind], cam, resolved.alpha_min)
     off = (counted - expected) / np.sqrt(expected)
-    print(f"2: {kind} {counted} in view, {expected:.0f} expected: {off:+.2f} sqrt N")
+    measured(f"2: {kind} {counted} in view, {expected:.0f} expected: {off:+.2f} sqrt N")
     assert abs(off) < 4
 
 
@@ -72,7 +73,7 @@ def check_sizes(kind, population, law=size_laws.number):
     share = np.concatenate([[0.0], np.cumsum(steps)]) / steps.sum()
     places = np.interp(sizes_mm, size_laws.diameter_mm(kind, d), share)
     p = stats.kstest(places, "uniform").pvalue
-    print(f"2: {kind} {len(found)} sizes, p = {p:.3f}")
+    measured(f"2: {kind} {len(found)} sizes, p = {p:.3f}")
     assert len(found) > 3_000
     assert p > 0.01
 
@@ -81,7 +82,7 @@ def check_depths(found):
     """Kolmogorov-Smirnov of z: density grows as z^2, p > 0.01."""
     share = (found[:, 2].astype(float) ** 3 - NEAR_M**3) / (Z_M**3 - NEAR_M**3)
     p = stats.kstest(share, "uniform").pvalue
-    print(f"2: depths p = {p:.3f}")
+    measured(f"2: depths p = {p:.3f}")
     assert p > 0.01
 
 
@@ -152,7 +153,7 @@ def check_snow_triangle(law, rates):
         of_sizes = np.trapezoid(number * np.pi / 4 * flake**2, d) * 1e-3 / (2.46 * rate)
         used = 1e3 * law.extinction_per_m(rate) / (2.46 * rate)
         if rate in (0.4, 1.0, 2.0, 3.0, 4.0):
-            print(f"12: {rate} mm/h: S' {flux:.3f}, size law {of_sizes:.3f}, used {used:.3f}")
+            measured(f"12: {rate} mm/h: S' {flux:.3f}, size law {of_sizes:.3f}, used {used:.3f}")
         assert 0.85 <= flux <= 1.25
         assert 0.93 <= of_sizes <= 1.07
         assert 0.93 <= used <= 1.07

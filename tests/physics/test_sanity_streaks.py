@@ -13,6 +13,7 @@ from physics_scene import (
     covariances,
     layer,
     long_axes,
+    measured,
     solid,
     splats_of_records,
 )
@@ -53,7 +54,7 @@ def check_axes(sweep=sweep_px, turning=(0.2, -0.6, 0.3)):
         if np.hypot(*streak[0]) < 3 or len(splats) != 1:
             continue
         worst = max(worst, angle_deg(long_axes(splats), streak)[0])
-    print(f"5: axes within {worst:.5f} deg")
+    measured(f"5: axes within {worst:.5f} deg")
     assert worst < 0.1
 
 
@@ -101,7 +102,7 @@ def check_parked(wind_m_per_s=3.0, seen_as=lambda records: records):
         speed = speeds[np.abs(speeds - fall).argmin()]
         classes.add(float(speed))
         worst = max(worst, angle_deg(axis, np.array([[-wind_m_per_s, speed]]))[0])
-    print(f"5: parked within {worst:.5f} deg, {len(classes)} classes")
+    measured(f"5: parked within {worst:.5f} deg, {len(classes)} classes")
     assert len(classes) > 3
     assert worst < 0.1
 
@@ -138,7 +139,7 @@ def check_focus_of_expansion(seen_as=lambda records: records, focus=None):
         relative = world @ cam.world_from_camera[:3, :3]
         focus = cam.focal_px[0] * relative[:2] / relative[2] + np.array(cam.principal_px)
     off = np.hypot(*(met - focus))
-    print(f"5: {len(pixels)} streaks meet {off:.3f} px off the heading")
+    measured(f"5: {len(pixels)} streaks meet {off:.3f} px off the heading")
     assert len(pixels) > 50
     assert off < 2.0
 
@@ -178,7 +179,7 @@ def check_exposure(drawn=splats_of_records):
             for exposure_s in (0.010, 0.005)
         )
         ratios = np.divide(half, whole_)
-        print(f"5: D {diameter_m} at {depth_m} m: length, alpha, sum ratios {ratios}")
+        measured(f"5: D {diameter_m} at {depth_m} m: length, alpha, sum ratios {ratios}")
         np.testing.assert_allclose(ratios[:2], (0.5, 2.0), rtol=0.005)
         assert abs(ratios[2] - 1) < 0.005
         silhouette_px2 = np.pi / 4 * (1266 * diameter_m / depth_m) ** 2
@@ -203,7 +204,7 @@ def peak_alpha(exposure_s, drawn=splats_of_records):
 
 def test_5_the_peak_of_a_long_streak_doubles():
     ratio = peak_alpha(0.020) / peak_alpha(0.040)
-    print(f"5: peak ratio {ratio:.4f}")
+    measured(f"5: peak ratio {ratio:.4f}")
     assert ratio == pytest.approx(2.0, rel=0.005)
 
 
@@ -234,13 +235,13 @@ def check_exposure_table(drawn=splats_of_records):
     """2 mm at 5 ms: 0.045 +- 0.005 on the mean, 0.058 along a flat top; and the whole table."""
     mean = mean_alpha(2, 5, drawn)
     flat_top = mean / (np.pi / 4)
-    print(f"6: 2 mm at 5 ms: mean {mean:.4f}, flat top {flat_top:.4f}")
+    measured(f"6: 2 mm at 5 ms: mean {mean:.4f}, flat top {flat_top:.4f}")
     assert abs(mean - 0.045) < 0.005
     assert abs(flat_top - 0.058) < 0.0025
     for diameter_mm, row in TABLE.items():
         for exposure_ms, alpha in row.items():
             found = mean_alpha(diameter_mm, exposure_ms, drawn)
-            print(f"6: {diameter_mm} mm, {exposure_ms} ms: {found:.4f} ({alpha})")
+            measured(f"6: {diameter_mm} mm, {exposure_ms} ms: {found:.4f} ({alpha})")
             # Parts of a streak lie over each other: up to 4 % of what they should take is lost.
             assert abs(found - alpha) < 0.05 * alpha + 0.0005
 
@@ -267,7 +268,7 @@ def check_pixel_sums(drawn=splats_of_records):
                 sums.append((1 - layer(drawn(records, cam), cam)[1].astype(float)).sum())
             area = np.pi / 4 * (1266 * 0.002 / depth_m) ** 2
             error = np.mean(sums) / area - 1
-            print(f"6: pixel sum {exposure_s} s {depth_m} m {error:+.4f}")
+            measured(f"6: pixel sum {exposure_s} s {depth_m} m {error:+.4f}")
             worst = max(worst, abs(error))
     assert worst < 0.02
 

@@ -13,7 +13,7 @@ from render_scene import make_camera, make_frame
 from weather_aug.particles import resolve as resolving
 from weather_aug.particles import statistics
 from weather_aug.particles.resolve import FAR_M
-from weather_aug.render import fields
+from weather_aug.render import fields, stage
 from weather_aug.render.compose import render
 from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
@@ -172,12 +172,11 @@ def test_3_rendered_walls(ambience, depth_m):
 
 
 def test_3_rendered_without_a_veil_is_found_out(ambience, monkeypatch):
-    from weather_aug.render import stage
+    medium_of = stage.medium_of
 
     def without(*args):
         return medium_of(*args)._replace(precipitation_per_m=np.float32(0))
 
-    medium_of = stage.medium_of
     monkeypatch.setattr(stage, "medium_of", without)
     with pytest.raises(AssertionError):
         check_rendered_walls(ambience, 60.0, (10_000,), seeds=2)

@@ -34,7 +34,7 @@ def extinction_per_m(weather):
 
 def mean_transmittance(weather, seed, ambience, budget):
     """Of a wall at 50 m."""
-    frame = make_frame(make_camera(80, 48, exposure_s=0.002), 60, 50.0)
+    frame = make_frame(make_camera(160, 96, 300.0, exposure_s=0.001), 60, 50.0)
     options = RenderOptions(budget)
     shot = render(frame, weather, seed=seed, ambience=ambience, options=options)
     return float(shot.transmittance.mean())

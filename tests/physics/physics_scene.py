@@ -3,12 +3,12 @@
 import logging
 
 import numpy as np
+from oracles import reference_render as reference
 
-from weather_aug.render.froxels import even_fog
 from weather_aug.render.medium import Medium
-from weather_aug.render.project import BAND_ROWS, project, sorted_in_blocks, split_by_band
-from weather_aug.render.shade import Tone, shade
+from weather_aug.render.project import project, sorted_in_blocks
 from weather_aug.render.stage import optics_of
+from weather_aug.render.tile import TILE_FLOATS, blend_band
 
 UP = np.array([0.0, 0, 1])
 CLEAR_AIR = Medium(*(np.float32(v) for v in (0, 0, 0, 0, 60 / 1024, 0, 3)))
@@ -53,35 +53,14 @@ def splats_of_records(records, camera, colour=(1.0, 1.0, 1.0), *, compensate=Tru
 def layer(splats, camera, level=0, depth_m=1000.0):
     """Picture (H, W, 3) and transmittance (H, W) of splats over a uniform sRGB level."""
     height, width = camera.height, camera.width
-    window = (0, 0, height, width)
-    splats, band_starts = split_by_band(splats, window, -(-height // BAND_ROWS))
-    through = np.empty((height, width), np.float32)
-    out = np.empty((3, height, width), np.uint8)
-    zero = np.float32(0)
-    srgb = np.arange(256) / 255
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    shade(
-        np.broadcast_to(np.asarray(level, np.uint8), (height, width, 3)).copy(),
-        np.full((height, width), depth_m, np.float32),
-        np.zeros((height, width), bool),
-        even_fog(),
-        window,
-        optics_of(camera, UP),
-        CLEAR_AIR,
-        NOTHING_RESOLVED,
-        linear.astype(np.float32),
-        np.eye(3, dtype=np.float32),
-        Tone(zero, np.float32(1), zero, zero),
-        np.ones(3, np.float32),
-        splats,
-        band_starts,
-        zero,
-        out,
-        through,
-        np.empty((height, width), np.uint8),
-        np.zeros((height, width), np.uint8),
-    )
-    return out.transpose(1, 2, 0), through
+    rows, columns = (-(-n // 4) * 4 for n in (height, width))
+    planes = np.empty((rows, 5, columns), np.float32)
+    planes[:, :3] = np.broadcast_to(reference.linear(level), 3)[:, None]
+    planes[:, 3], planes[:, 4] = 1.0, depth_m
+    tiles = np.empty((rows // 4, columns // 4, TILE_FLOATS), np.float32)
+    blend_band(splats, (0, 0, height, width), 0, planes, tiles)
+    light = planes[:height, :3, :width].transpose(0, 2, 1).astype(float)
+    return np.round(reference.srgb(light)).astype(np.uint8), planes[:height, 3, :width].copy()
 
 
 def covariances(splats):

@@ -6,18 +6,34 @@ import os
 
 os.environ.setdefault("NO_ALBUMENTATIONS_UPDATE", "1")
 
+from pathlib import Path
+
 import cv2
+import numba
 import torch
 
-from benchmarks import overlays, sample
+from benchmarks import crowds, fidelity, growth, overlays, plot, sample, stages
+from benchmarks.report import write_results
+
+OUT = Path("out/bench")
 
 
 def main() -> None:
-    """Run every benchmark on one thread."""
+    """Run every benchmark on one thread; write the numbers and the plot of the growth."""
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
-    overlays.main()
-    sample.main()
+    numba.set_num_threads(1)
+    results = {
+        "overlays": overlays.measure(),
+        "crowds": crowds.measure(),
+        "fidelity": fidelity.measure(),
+        "sample": sample.measure(),
+        "stages": stages.measure(),
+        "growth": growth.measure(),
+    }
+    write_results(OUT / "results.json", results)
+    plot.draw(results["growth"], OUT / "scaling.png")
+    print(f"\nall numbers: {OUT / 'results.json'}; growth of the cost: {OUT / 'scaling.png'}")
 
 
 if __name__ == "__main__":

@@ -7,14 +7,17 @@ from pathlib import Path
 
 import weather_aug
 from weather_aug._compiled import _package_stamp
-from weather_aug.render.planes import clean_depth
+from weather_aug.render.surface import depth_row
 
 PROBE = """
 import numpy as np
-from weather_aug.render.planes import clean_depth
+from weather_aug.render.surface import Surface, depth_row
+bytes_, halves = np.empty(0, np.uint8), np.empty(0, np.uint16)
 depth = np.array([50000.0], np.float32)
-clean_depth(depth)
-print(depth[0], sum(clean_depth.stats.cache_hits.values()))
+surface = Surface(bytes_.reshape(0, 3), (0, 0, 1, 1), halves, depth, bytes_, 1)
+out = np.empty(1, np.float32)
+depth_row(surface, 0, 0, out.view(np.int32), out)
+print(out[0], sum(depth_row.stats.cache_hits.values()))
 """
 
 
@@ -31,7 +34,7 @@ def probe(folder):
 
 
 def test_the_cache_carries_the_digest_of_the_whole_package():
-    assert clean_depth._cache._cache_file._source_stamp == _package_stamp()
+    assert depth_row._cache._cache_file._source_stamp == _package_stamp()
 
 
 def test_a_constant_changed_in_another_module_changes_the_result(tmp_path):

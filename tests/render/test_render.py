@@ -9,14 +9,16 @@ from hypothesis import strategies as st
 from render_scene import make_camera, make_frame
 
 from weather_aug.air import Air
+from weather_aug.clip.types import Frame
 from weather_aug.errors import ArgumentError
 from weather_aug.particles.kernels import scatter, solve_reach
-from weather_aug.render import planes
-from weather_aug.render.compose import _clean_depth, checked_window, render, warm_up
+from weather_aug.render.compose import checked_window, render, warm_up
+from weather_aug.render.label import read_labels
 from weather_aug.render.light import Ambience, airlight_from_sky, ambience_of
 from weather_aug.render.options import RenderOptions
 from weather_aug.render.project import project, sorted_in_blocks, split_by_band
 from weather_aug.render.shade import shade
+from weather_aug.render.surface import depth_of, surface_of
 from weather_aug.scene.policy import weather_of
 from weather_aug.taxonomy import SKY
 from weather_aug.weather import Weather
@@ -251,12 +253,18 @@ def test_ambience_measures_sky_ground_and_the_rest():
 
 def test_half_precision_depth_is_widened_exactly():
     """Every float16 there is: positive finite ones up to the far limit keep their value."""
-    half = np.arange(2**16, dtype=np.uint16).view(np.float16)
-    wide = _clean_depth(half.reshape(256, 256)).reshape(-1)
+    half = np.arange(2**16, dtype=np.uint16).view(np.float16).reshape(256, 256)
+    frame = street_frame()
+    camera = replace(frame.camera, width=256, height=256)
+    picture = np.zeros((256, 256, 3), np.uint8)
+    frame = Frame(frame.key, 0.0, camera, picture, None, half)
+    window = (0, 0, 256, 256)
     expected = half.astype(np.float32)
     far = ~((expected > 0) & (expected < 60000))
-    np.testing.assert_array_equal(np.where(far, np.inf, expected), wide)
-    np.testing.assert_array_equal(wide, _clean_depth(half.astype(np.float32)[None])[0])
+    expected[far] = np.inf
+    single = replace(frame, depth_m=half.astype(np.float32))
+    for candidate in (frame, single):
+        np.testing.assert_array_equal(expected, depth_of(surface_of(candidate), window))
 
 
 def test_warm_up_leaves_nothing_to_compile():
@@ -267,10 +275,9 @@ def test_warm_up_leaves_nothing_to_compile():
         project,
         sorted_in_blocks,
         split_by_band,
-        planes.widen_depth,
-        planes.clean_depth,
+        read_labels,
     )
-    kernels += (planes.raise_sky, planes.read_labels, scatter, solve_reach)
+    kernels += (scatter, solve_reach)
     before = [len(kernel.signatures) for kernel in kernels]
     frame = street_frame()
     half = replace(frame, depth_m=np.nan_to_num(frame.depth_m, posinf=65504).astype(np.float16))

@@ -18,6 +18,7 @@ from weather_aug.render.project import BAND_ROWS, FAINTEST, log, sorted_in_block
 from weather_aug.render.project import project as project_kernel
 from weather_aug.render.shade import Tone, shade
 from weather_aug.render.stage import optics_of
+from weather_aug.render.surface import surface_of
 from weather_aug.weather import Weather
 
 UP = np.array([0.0, 0, 1])
@@ -63,9 +64,9 @@ def transmittance(particles, camera, depth_m=1000.0):
     splats, band_starts = split_by_band(splats, window, -(-height // BAND_ROWS))
     through = np.empty((height, width), np.float32)
     zero = np.float32(0)
+    frame = make_frame(camera, 0, depth_m)
     shade(
-        np.zeros((height, width, 3), np.uint8),
-        np.full((height, width), depth_m, np.float32),
+        surface_of(frame),
         np.zeros((height, width), bool),
         even_fog(),
         window,
@@ -78,7 +79,7 @@ def transmittance(particles, camera, depth_m=1000.0):
         np.ones(3, np.float32),
         splats,
         band_starts,
-        zero,
+        (zero, zero),
         np.empty((3, height, width), np.uint8),
         through,
         np.empty((height, width), np.uint8),

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,14 +15,13 @@ from weather_aug.clip.types import Camera, Frame, FrameKey
 from weather_aug.errors import ArgumentError
 from weather_aug.particles.field import Window
 from weather_aug.particles.shelter import Shelter
-from weather_aug.render import planes
 from weather_aug.render.fields import RigMotion, fields_of
 from weather_aug.render.label import NEIGHBOURHOOD_PX, readable_labels
 from weather_aug.render.light import Ambience
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.render.scattering import scattering_margin_px
 from weather_aug.render.stage import Planes, Stage
-from weather_aug.taxonomy import SKY
+from weather_aug.render.surface import depth_of, surface_of
 from weather_aug.weather import Weather
 
 Float32 = NDArray[np.float32]
@@ -44,8 +42,15 @@ class RenderedFrame:
     """(H, W), 1 where the surface is undetectable or beyond the optical range."""
     transmittance: Float32
     """(H, W) share of the surface's light that reaches the pixel, in [0, 1]."""
-    depth: Float32
-    """(H, W) z-depth of the surface, metres, `inf` for the sky."""
+    frame: Frame
+    """The recorded frame behind the weather."""
+    window: Window
+    """Which part of it (top, left, height, width)."""
+
+    @cached_property
+    def depth(self) -> Float32:
+        """(H, W) z-depth of the surface, metres, `inf` for the sky; read on first use."""
+        return depth_of(surface_of(self.frame), self.window)
 
 
 def render(
@@ -99,16 +104,15 @@ def render(
     if air is None:
         air = air_of(weather, frame.time_s, seed)
     outer = _with_margin(window, _margin_px(frame, options), height, width)
-    image, label, depth = _cut(frame, outer)
-    sky = _sky_by_depth(depth) if label is None else label == SKY
-    stage = Stage(image, depth, sky, outer, frame.camera, weather, ambience, seed, air, options)
+    surface = surface_of(frame)
+    stage = Stage(surface, outer, frame.camera, weather, ambience, seed, air, options)
     if options.preset == "physical":
         fields = fields_of(weather, seed, air, ambience.axes_world, options, rig)
         shot = stage.shaded(fields, shelter, frame.time_s)
     else:
         here = frame.camera.world_from_camera
         shot = stage.published(rig or RigMotion(here, here), frame.time_s)
-    return _trimmed(shot, label, depth, outer, window)
+    return _trimmed(shot, frame, outer, window)
 
 
 def checked_window(window: Window | None, height: int, width: int) -> Window:
@@ -151,55 +155,23 @@ def warm_up() -> None:
 
 
 def _clear(frame: Frame, window: Window) -> RenderedFrame:
-    image, label, depth = _cut(frame, window)
+    part = _part(window)
+    label = None if frame.label is None else np.array(frame.label[part], order="C")
+    size = window[2:]
     return RenderedFrame(
-        image,
+        np.array(frame.image[part], order="C"),
         label,
         None if label is None else label.copy(),
-        np.zeros(depth.shape, np.uint8),
-        np.ones(depth.shape, np.float32),
-        depth,
+        np.zeros(size, np.uint8),
+        np.ones(size, np.float32),
+        frame,
+        window,
     )
 
 
-def _cut(frame: Frame, window: Window) -> tuple[UInt8, UInt8 | None, Float32]:
-    """Copies of a window of image, label and depth (float32, far and unknown as `inf`).
-
-    Copies, because the kernels would be compiled once more for arrays that may not be written. A
-    label of sky outranks a measured depth: sensors see leaves and wires before it.
-    """
+def _part(window: Window) -> tuple[slice, slice]:
     top, left, height, width = window
-    part = (slice(top, top + height), slice(left, left + width))
-    assert frame.depth_m is not None
-    depth = _clean_depth(np.asarray(frame.depth_m[part]))
-    label = None if frame.label is None else np.array(frame.label[part], order="C")
-    if label is not None:
-        planes.raise_sky(label.reshape(-1), np.uint8(SKY), depth.reshape(-1))
-    return np.array(frame.image[part], order="C"), label, depth
-
-
-def _clean_depth(depth: NDArray[Any]) -> Float32:
-    """A float32 copy with far and unknown as `inf`."""
-    if depth.dtype == np.float16:
-        wide = np.empty(depth.shape, np.float32)
-        bits = np.array(depth, order="C").view(np.uint16)
-        planes.widen_depth(bits.reshape(-1), wide.view(np.int32).reshape(-1))
-        return wide
-    copy = np.array(depth, np.float32, order="C")
-    planes.clean_depth(copy.reshape(-1))
-    return copy
-
-
-def _sky_by_depth(depth: Float32) -> NDArray[np.bool_]:
-    """Where the sky may show: everything far, and the ring around it that depth sensors miss.
-
-    Inside the mask only pixels as bright as the sky are taken for it, so that the ring costs
-    nothing where the edge was right.
-    """
-    size = (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX)
-    far = (depth == np.inf).astype(np.uint8)
-    ringed: NDArray[np.bool_] = cv2.dilate(far, np.ones(size, np.uint8)).astype(bool)
-    return ringed
+    return slice(top, top + height), slice(left, left + width)
 
 
 def _with_margin(window: Window, margin: int, height: int, width: int) -> Window:
@@ -222,24 +194,24 @@ def _margin_px(frame: Frame, options: RenderOptions) -> int:
     return margin
 
 
-def _trimmed(
-    shot: Planes,
-    label: UInt8 | None,
-    depth: Float32,
-    outer: Window,
-    window: Window,
-) -> RenderedFrame:
+def _trimmed(shot: Planes, frame: Frame, outer: Window, window: Window) -> RenderedFrame:
     """Labels from the outer window, then everything cut to the inner one."""
-    top, left = window[0] - outer[0], window[1] - outer[1]
-    part = (slice(top, top + window[2]), slice(left, left + window[3]))
-    seen = np.zeros(depth.shape, np.uint8) if label is None else label
-    honest, invalid = readable_labels(seen, shot.transmittance, shot.distinct, shot.covered)
+    part = _part((window[0] - outer[0], window[1] - outer[1], *window[2:]))
     cut = np.ascontiguousarray
+    full = None if frame.label is None else np.array(frame.label[_part(window)], order="C")
+    honest = None if full is None else full.copy()
+    invalid = np.zeros(window[2:], np.uint8)
+    if shot.hazy_count or shot.covered.any():
+        seen = np.zeros_like(shot.covered) if frame.label is None else frame.label[_part(outer)]
+        planes = readable_labels(cut(seen), shot.transmittance, shot.distinct, shot.covered)
+        invalid = cut(planes[1][part])
+        honest = None if full is None else cut(planes[0][part])
     return RenderedFrame(
         image=cut(shot.image[part]),
-        label=None if label is None else cut(honest[part]),
-        label_full=None if label is None else label[part].copy(),
-        invalid=cut(invalid[part]),
+        label=honest,
+        label_full=full,
+        invalid=invalid,
         transmittance=cut(shot.transmittance[part]),
-        depth=cut(depth[part]),
+        frame=frame,
+        window=window,
     )

@@ -12,6 +12,7 @@ Compiled; per-pixel numbers are float32.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -72,6 +73,7 @@ def volume_of(
     )
 
 
+@lru_cache(maxsize=1)
 def even_fog() -> FogVolume:
     """A volume without nodes, to hand to a kernel where the fog is even: do not look it up."""
     return volume_of(np.ones((0, 1, 1), np.float32), 0, 0, 1.0)

@@ -149,13 +149,13 @@ def reach_row(depth, ray_x, ray_y, optics, slant, reach):
     layer_m, longest_m = np.float32(1000.0), np.float32(20000.0)
     across = one + ray_y * ray_y
     rise_y = optics.up_y * ray_y + optics.up_z
-    deepest = np.float32(0.0)
+    # Counted, because a largest value of floats would not be found in vectors.
+    far_count = np.int32(0)
     for x in range(depth.shape[0]):
         slant[x] = np.sqrt(across + ray_x[x] * ray_x[x])
         reach[x] = depth[x]
-    for x in range(depth.shape[0]):
-        deepest = max(deepest, depth[x])
-    if deepest < far:
+        far_count += np.int32(1) if depth[x] >= far else np.int32(0)
+    if far_count == 0:
         return
     for x in range(depth.shape[0]):
         sine = (optics.up_x * ray_x[x] + rise_y) / slant[x]

@@ -7,7 +7,7 @@ import numpy as np
 from weather_aug._compiled import compiled, inlined
 from weather_aug.render.medium import carried_at, near_optical_depth, survival
 
-BAND_ROWS = 16
+BAND_ROWS = 8
 """Rows that are shaded, splatted and encoded together, while they are in the cache."""
 DEPTH_KEYS = 4096
 MOST_PARTS = 16

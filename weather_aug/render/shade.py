@@ -13,6 +13,7 @@ from weather_aug._compiled import compiled
 from weather_aug.render.froxels import share_row
 from weather_aug.render.medium import reach_row, transmittance_row
 from weather_aug.render.project import BAND_ROWS
+from weather_aug.render.surface import depth_row, light_row, sky_row
 from weather_aug.render.tile import TILE_FLOATS, blend_band, cover_splat
 
 
@@ -28,9 +29,8 @@ class Tone(NamedTuple):
 
 @compiled
 def shade(
-    image,
-    depth,
-    sky,
+    surface,
+    ring,
     patches,
     window,
     optics,
@@ -42,7 +42,7 @@ def shade(
     airlight,
     splats,
     band_starts,
-    least_contrast,
+    limits,
     out,
     through,
     distinct,
@@ -51,9 +51,8 @@ def shade(
     """Render the window: tone, fog and particles in linear light, band by band.
 
     Args:
-        image: (H, W, 3) uint8 of the window.
-        depth: (H, W) float32 z-depth of the window, `inf` for far.
-        sky: (H, W) bool of the window.
+        surface: The recorded picture.
+        ring: (H, W) bool of the window, where the sky may show; (0, 0) where there are labels.
         patches: FogVolume, of no slices where the fog is even.
         window: (top, left, height, width) in the whole picture.
         optics: Camera of the whole picture.
@@ -65,14 +64,20 @@ def shade(
         airlight: (3,) float32.
         splats: (M, 16) float32, band by band.
         band_starts: (bands + 1,) where each band's splats start.
-        least_contrast: Linear difference from the airlight that can just be seen.
+        limits: Linear difference from the airlight that can just be seen, and the transmittance
+            below which a surface must differ from it to be seen.
         out: (3, H, W) uint8 out.
         through: (H, W) float32 out: transmittance of air and particles.
-        distinct: (H, W) uint8 out: 1 where what is left of the surface's difference from the
+        distinct: (H, W) uint8 out: 1 where what is left of a surface's difference from the
             airlight can be seen.
-        covered: (H, W) uint8, zero: set where a large particle hides the surface.
+        covered: (H, W) uint8, zero: set where a large particle hides the surface; may be (0, 0)
+            if no splat is large.
+
+    Returns:
+        Number of pixels whose surface is below the second limit.
     """
     top, left, height, width = window
+    least_contrast, hazy = limits
     ray_x = np.empty(width, np.float32)
     for x in range(width):
         ray_x[x] = (np.float32(x + left) - optics.cx) / optics.fx
@@ -81,15 +86,18 @@ def shade(
     # It is a multiple of 4 beyond the width, so that tiles fit.
     stride = (width + 15) // 16 * 16 + 80
     planes = np.zeros((BAND_ROWS, 5, stride), np.float32)
+    bits = planes.view(np.int32)
     tiles = np.empty((BAND_ROWS // 4, stride // 4, TILE_FLOATS), np.float32)
     patchy = patches.share.shape[0] > 0
     nodes = np.empty(patches.share.shape[0] * patches.share.shape[2], np.float32)
     place = np.empty(width if patchy else 0, np.uint32)
     share = np.empty(width if patchy else 0, np.float32)
     gap = np.empty((BAND_ROWS, width), np.float32)
+    sky = np.empty((BAND_ROWS, width), np.uint8)
     tau = np.empty(width, np.float32)
     slant = np.empty(width, np.float32)
     overcast = tone.overcast > np.float32(0.0)
+    hidden = 0
     for band in range(band_starts.shape[0] - 1):
         y0 = band * BAND_ROWS
         y1 = min(y0 + BAND_ROWS, height)
@@ -97,19 +105,25 @@ def shade(
             k = y - y0
             ray_y = (np.float32(y + top) - optics.cy) / optics.fy
             red, green, blue = planes[k, 0, :width], planes[k, 1, :width], planes[k, 2, :width]
-            clear = planes[k, 3, :width]
-            planes[k, 4, :width] = depth[y]
-            reach_row(depth[y], ray_x, ray_y, optics, slant, clear)
+            clear, depth = planes[k, 3, :width], planes[k, 4, :width]
+            depth_row(surface, y + top, left, bits[k, 4, :width], depth)
+            sky_row(surface, y + top, left, sky[k])
+            reach_row(depth, ray_x, ray_y, optics, slant, clear)
             if patchy:
                 share_row(patches, y + top, left, clear, nodes, place, share)
             transmittance_row(
                 ray_x, ray_y, slant, share, optics, medium, resolved_depth, tau, clear
             )
-            _decode_row(image[y], linear, red, green, blue)
+            light_row(surface, y + top, left, linear, red, green, blue)
             if overcast:
-                _overcast_row(
-                    sky[y], ray_x, ray_y, optics, matrix, tone, airlight, red, green, blue
-                )
+                if ring.shape[0] > 0:
+                    _overcast_row(
+                        ring[y], ray_x, ray_y, optics, matrix, tone, airlight, red, green, blue
+                    )
+                else:
+                    _overcast_row(
+                        sky[k], ray_x, ray_y, optics, matrix, tone, airlight, red, green, blue
+                    )
             _fog_row(clear, airlight, red, green, blue, gap[k])
         mine = splats[band_starts[band] : band_starts[band + 1]]
         blend_band(mine, window, y0, planes, tiles)
@@ -120,20 +134,13 @@ def shade(
             k = y - y0
             for channel in range(3):
                 if tone.encoded > np.float32(0.0):
-                    _level_row(planes[k, channel, :width])
+                    _level_row(planes[k, channel, :width], out[channel, y])
                 else:
-                    encode_row(planes[k, channel, :width])
-                _quantise_row(planes[k, channel, :width], out[channel, y])
+                    encode_row(planes[k, channel, :width], out[channel, y])
             through[y] = planes[k, 3, :width]
-            _distinct_row(gap[k], through[y], least_contrast, distinct[y])
-
-
-@compiled
-def _decode_row(image, linear, red, green, blue):
-    for x in range(image.shape[0]):
-        red[x] = linear[image[x, 0]]
-        green[x] = linear[image[x, 1]]
-        blue[x] = linear[image[x, 2]]
+            _distinct_row(gap[k], through[y], sky[k], least_contrast, distinct[y])
+            hidden += _count_below(through[y], sky[k], hazy)
+    return hidden
 
 
 @compiled
@@ -151,7 +158,7 @@ def _overcast_row(sky, ray_x, ray_y, optics, matrix, tone, airlight, red, green,
         matte = y * brightest - np.float32(0.9)
         matte = matte if matte > zero else zero
         matte = matte if matte < one else one
-        weight = tone.overcast * matte if sky[x] else zero
+        weight = tone.overcast * matte if sky[x] != 0 else zero
         sine = (optics.up_x * ray_x[x] + rise_y) / np.sqrt(across + ray_x[x] * ray_x[x])
         brighter = one + tone.zenith_gain * (sine if sine > zero else zero)
         r_new = matrix[0, 0] * r + matrix[0, 1] * g + matrix[0, 2] * b
@@ -176,8 +183,8 @@ def _fog_row(through, airlight, red, green, blue, gap):
 
 
 @compiled
-def encode_row(light):
-    """Turn linear light into sRGB levels plus one half, in place, to 0.1 of a level.
+def encode_row(light, out):
+    """Turn linear light into sRGB levels, rounded, with an error of 0.1 of a level before that.
 
     A polynomial in the square root on the power branch (largest error 0.083 levels), the exact
     line below it; every 8-bit level survives decoding and encoding.
@@ -194,27 +201,31 @@ def encode_row(light):
         p = np.float32(1.5179509) + s * p
         p = np.float32(-0.0401096) + s * p
         p = p if v > np.float32(0.0031308) else np.float32(12.92) * v
-        light[x] = p * np.float32(255.0) + np.float32(0.5)
+        out[x] = np.uint8(np.int32(p * np.float32(255.0) + np.float32(0.5)))
 
 
 @compiled
-def _level_row(light):
-    """Turn colours that are sRGB already into levels plus one half, in place."""
+def _level_row(light, out):
+    """Turn colours that are sRGB already into levels, rounded."""
     zero, one = np.float32(0.0), np.float32(1.0)
     for x in range(light.shape[0]):
         v = light[x]
         v = v if v > zero else zero
         v = v if v < one else one
-        light[x] = v * np.float32(255.0) + np.float32(0.5)
+        out[x] = np.uint8(np.int32(v * np.float32(255.0) + np.float32(0.5)))
 
 
 @compiled
-def _quantise_row(levels, out):
-    for x in range(levels.shape[0]):
-        out[x] = np.uint8(np.int32(levels[x]))
-
-
-@compiled
-def _distinct_row(gap, through, least_contrast, out):
+def _distinct_row(gap, through, sky, least_contrast, out):
     for x in range(gap.shape[0]):
-        out[x] = np.uint8(1) if gap[x] * through[x] >= least_contrast else np.uint8(0)
+        seen = (gap[x] * through[x] >= least_contrast) & (sky[x] == np.uint8(0))
+        out[x] = np.uint8(1) if seen else np.uint8(0)
+
+
+@compiled
+def _count_below(through, sky, limit):
+    count = np.int32(0)
+    for x in range(through.shape[0]):
+        below = (through[x] < limit) & (sky[x] == np.uint8(0))
+        count += np.int32(1) if below else np.int32(0)
+    return count

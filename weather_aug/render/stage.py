@@ -20,13 +20,14 @@ from weather_aug.particles.shelter import Shelter
 from weather_aug.render.fields import RigMotion, published_splats, splats_of
 from weather_aug.render.fog import fog_volume
 from weather_aug.render.froxels import FogVolume, even_fog
-from weather_aug.render.label import least_linear_contrast
+from weather_aug.render.label import HAZY_TRANSMITTANCE, least_linear_contrast
 from weather_aug.render.light import Ambience
 from weather_aug.render.medium import SPRAY_HEIGHT_M, Medium, Optics, optical_depth
 from weather_aug.render.options import RenderOptions
 from weather_aug.render.project import BAND_ROWS, split_by_band
 from weather_aug.render.scattering import scattered_background
 from weather_aug.render.shade import Tone, shade
+from weather_aug.render.surface import Surface, depth_of, repainted, ring_of
 from weather_aug.weather import Weather
 
 Float32 = NDArray[np.float32]
@@ -45,18 +46,36 @@ class Planes(NamedTuple):
     """(H, W), 1 where what is left of the surface can be told from the airlight."""
     covered: UInt8
     """(H, W), 1 where a large particle hides the surface."""
+    hazy_count: int
+    """Surfaces so hazy that they must differ from the airlight to be seen, pixels."""
+
+
+class _Air(NamedTuple):
+    """What is between the camera and the surfaces."""
+
+    medium: Medium
+    carried: Float32
+    """Optical depth of drawn particles by depth."""
+    patches: FogVolume
+
+
+class _Look(NamedTuple):
+    """How recorded colours change."""
+
+    curve: Float64
+    """(256,) light by sRGB level."""
+    matrix: Float64
+    """(3, 3) of colours after it."""
+    overcast: float
+    encoded: float
+    """1 where colours stay in sRGB."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
     """A window of a picture, its camera, its weather and its light."""
 
-    image: UInt8
-    """(H, W, 3) sRGB of the window."""
-    depth: Float32
-    """(H, W) metres, `inf` for far."""
-    sky: NDArray[np.bool_]
-    """(H, W) where the sky may show."""
+    surface: Surface
     window: Window
     camera: Camera
     """Of the whole picture."""
@@ -70,70 +89,63 @@ class Stage:
         self, fields: Sequence[ParticleField], shelter: Shelter | None, time_s: float
     ) -> Planes:
         """The window with the weather's sky, medium and particles."""
-        options, weather = self.options, self.weather
-        budget = options.max_particles // max(len(fields), 1)
+        weather = self.weather
+        budget = self.options.max_particles // max(len(fields), 1)
         resolved = [field.resolve(self.camera, budget) for field in fields]
         carried = np.zeros(DEPTH_BINS + 1, np.float32)
         for part in resolved:
             carried = carried + part.optical_depth
-        optics = optics_of(self.camera, self.ambience.axes_world[2])
         medium = medium_of(weather, fields, self.ambience)
-        patches = self._patches()
-        image = self.image
-        if options.multiple_scattering:
-            tau = optical_depth(self.depth, self.window, optics, medium, carried, patches)
-            image = scattered_background(image, tau, max(self.camera.focal_px))
-        light = self.ambience.under(weather.overcast)
+        air = _Air(medium, carried, self._patches())
         splats = splats_of(
             self.camera,
             time_s,
             fields,
             resolved,
-            light,
-            optics,
+            self.ambience.under(weather.overcast),
+            self._optics,
             medium,
             carried,
             self.window,
             shelter,
         )
-        curve, matrix = tone(weather.overcast)
-        sky_luminance = max(float(self.ambience.sky @ LUMINANCE), 0.05)
-        look = (weather.overcast, sky_luminance, ZENITH_GAIN, 0.0)
-        return self._run(image, patches, optics, medium, carried, curve, matrix, look, splats)
+        scattered = self.options.multiple_scattering
+        surface = self._scattered(air) if scattered else self.surface
+        look = _Look(*tone(weather.overcast), weather.overcast, 0.0)
+        return self._run(surface, air, look, splats)
 
     def published(self, rig: RigMotion, time_s: float) -> Planes:
         """The window with the weather's sky and the particles of WeatherEdit's release.
 
         First the background, then the particles over it, blended as they are stored: in sRGB.
         """
-        optics = optics_of(self.camera, self.ambience.axes_world[2])
-        nothing = np.zeros(DEPTH_BINS + 1, np.float32)
+        weather = self.weather
         clear = medium_of(Weather(), (), self.ambience)
-        curve, matrix = tone(self.weather.overcast)
-        sky_luminance = max(float(self.ambience.sky @ LUMINANCE), 0.05)
-        look = (self.weather.overcast, sky_luminance, ZENITH_GAIN, 0.0)
-        none = np.empty((0, 16), np.float32)
-        still = even_fog()
-        background = self._run(self.image, still, optics, clear, nothing, curve, matrix, look, none)
+        air = _Air(clear, np.zeros(DEPTH_BINS + 1, np.float32), even_fog())
+        look = _Look(*tone(weather.overcast), weather.overcast, 0.0)
+        background = self._run(self.surface, air, look, np.empty((0, 16), np.float32))
         splats = published_splats(
             self.camera,
             time_s,
-            self.weather,
+            weather,
             self.seed,
             self.ambience.axes_world,
             self.options,
             rig,
-            optics,
+            self._optics,
             self.window,
         )
-        levels = np.arange(256) / 255.0
-        plain = (0.0, sky_luminance, ZENITH_GAIN, 1.0)
-        return self._run(
-            background.image, still, optics, clear, nothing, levels, np.eye(3), plain, splats
-        )
+        painted = repainted(self.surface, background.image, self.window)
+        return self._run(painted, air, _Look(np.arange(256) / 255, np.eye(3), 0.0, 1.0), splats)
+
+    @property
+    def _optics(self) -> Optics:
+        return optics_of(self.camera, self.ambience.axes_world[2])
 
     def _patches(self) -> FogVolume:
         weather, axes = self.weather, self.ambience.axes_world
+        if weather.fog_patchiness == weather.fog_puffs == 0.0:
+            return even_fog()
         volume = fog_volume(
             self.camera,
             self.window,
@@ -147,48 +159,49 @@ class Stage:
         )
         return even_fog() if volume is None else volume
 
-    def _run(
-        self,
-        image: UInt8,
-        patches: FogVolume,
-        optics: Optics,
-        medium: Medium,
-        carried: Float32,
-        curve: Float64,
-        matrix: Float64,
-        look: tuple[float, float, float, float],
-        splats: Float32,
-    ) -> Planes:
+    def _scattered(self, air: _Air) -> Surface:
+        """The surface with what lies behind thick air blurred."""
+        top, left, height, width = self.window
+        whole = self.surface.image.reshape(-1, self.surface.width, 3)
+        image = np.ascontiguousarray(whole[top : top + height, left : left + width])
+        depth = depth_of(self.surface, self.window)
+        tau = optical_depth(depth, self.window, self._optics, *air)
+        image = scattered_background(image, tau, max(self.camera.focal_px))
+        return repainted(self.surface, image, self.window)
+
+    def _run(self, surface: Surface, air: _Air, look: _Look, splats: Float32) -> Planes:
         """Allocate what the kernel writes, and run it."""
         _, _, height, width = self.window
         splats, band_starts = split_by_band(splats, self.window, -(-height // BAND_ROWS))
+        sky_luminance = max(float(self.ambience.sky @ LUMINANCE), 0.05)
+        sky = (look.overcast, sky_luminance, ZENITH_GAIN, look.encoded)
+        limits = (least_linear_contrast(self.ambience.airlight), HAZY_TRANSMITTANCE)
         levels = np.empty((3, height, width), np.uint8)
         through = np.empty((height, width), np.float32)
         distinct = np.empty((height, width), np.uint8)
         covered = np.zeros((height, width), np.uint8)
-        shade(
-            image,
-            self.depth,
-            self.sky,
-            patches,
+        hazy_count = shade(
+            surface,
+            ring_of(surface, self.window),
+            air.patches,
             self.window,
-            optics,
-            medium,
-            carried,
-            curve.astype(np.float32),
-            matrix.astype(np.float32),
-            Tone(*(np.float32(v) for v in look)),
+            self._optics,
+            air.medium,
+            air.carried,
+            look.curve.astype(np.float32),
+            look.matrix.astype(np.float32),
+            Tone(*(np.float32(v) for v in sky)),
             self.ambience.airlight.astype(np.float32),
             splats,
             band_starts,
-            np.float32(least_linear_contrast(self.ambience.airlight)),
+            tuple(np.float32(v) for v in limits),
             levels,
             through,
             distinct,
             covered,
         )
         merged: UInt8 = cv2.merge(tuple(levels))
-        return Planes(merged, through, distinct, covered)
+        return Planes(merged, through, distinct, covered, hazy_count)
 
 
 def optics_of(camera: Camera, up_world: Float64) -> Optics:

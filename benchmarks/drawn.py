@@ -1,0 +1,59 @@
+"""What a render draws: particles, their splats, and the pixels that these touch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+from unittest.mock import patch
+
+import numba
+import numpy as np
+
+from weather_aug.render import stage
+
+
+class Drawn(NamedTuple):
+    """How much a frame has to draw."""
+
+    particles: int
+    """That touch the picture."""
+    splats: int
+    """A long streak is drawn as several."""
+    fragments: int
+    """Pixels inside the splats' footprints, counted once for each splat."""
+
+
+def drawn(run: Callable[[], object], height: int, width: int) -> Drawn:
+    """What `run`, a call of `render` for a whole (height, width) picture, draws."""
+    seen: list[Any] = []
+    original = stage.splats_of
+
+    def watched(*args: Any, **kwargs: Any) -> Any:
+        seen.append(original(*args, **kwargs))
+        return seen[-1]
+
+    with patch.object(stage, "splats_of", watched):
+        run()
+    splats = seen[-1]
+    # The parts of a streak follow each other and share shape and depth.
+    new = (np.diff(splats[:, 2:8], axis=0) != 0).any(axis=1)
+    particles = int(new.sum()) + 1 if len(splats) else 0
+    return Drawn(particles, len(splats), int(fragments(splats, height, width)))
+
+
+@numba.njit(cache=False)
+def fragments(splats, height, width):
+    """Pixels of the picture inside the footprints of splats (M, 16), before the depth test."""
+    count = 0
+    for m in range(splats.shape[0]):
+        s = splats[m]
+        half_u = s[13] + abs(s[14]) * s[12]
+        first, last = max(int(s[1] - s[12]), 0), min(int(s[1] + s[12]) + 1, height - 1)
+        start, stop = max(int(s[0] - half_u), 0), min(int(s[0] + half_u) + 1, width - 1)
+        for y in range(first, last + 1):
+            dy = np.float32(y) - s[1]
+            for x in range(start, stop + 1):
+                dx = np.float32(x) - s[0]
+                power = (s[2] * dx + np.float32(2.0) * s[3] * dy) * dx + s[4] * dy * dy
+                count += power <= s[5]
+    return count

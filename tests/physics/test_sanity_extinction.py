@@ -183,7 +183,11 @@ def test_3_rendered_without_a_veil_is_found_out(ambience, monkeypatch):
 
 
 def check_resolution(ambience, weather, seeds, tolerance=0.01):
-    """Mean transmittance and mean luminance at full, half and quarter resolution agree to 1 %."""
+    """Mean transmittance and mean luminance at full, half and quarter resolution agree to 1 %.
+
+    Over a wall of the scene's own middle grey: where fewer drops are resolved more are veil, whose
+    colour is the airlight's, so that over a wall four times darker 50 mm/h change by 1.3 %.
+    """
     full = make_camera(480, 288, exposure_s=0.002)
     means = []
     for k in (1, 2, 4):

@@ -64,21 +64,20 @@ def test_5_axes():
 
 def test_5_a_forgotten_turn_or_approach_is_found_out():
     with pytest.raises(AssertionError):
-        check_axes(lambda p, v, cam: sweep_px(p, v, replace_turning(cam)))
+        check_axes(lambda p, v, cam: sweep_px(p, v, without_turning(cam)))
     with pytest.raises(AssertionError):
         check_axes(lambda p, v, cam: sweep_px(p, v * [1, 1, 0], cam))
 
 
-def replace_turning(cam):
+def without_turning(cam):
     return replace(cam, angular_velocity_rad_per_s=np.zeros(3))
 
 
-def drops_of_a_field(cam, wind, reach_m=6.0, sways=False):
-    """Rain as the field has it, of the sizes and at the depths whose streaks are long."""
+def drops_of_a_field(cam, wind, reach_m=6.0):
+    """Rain as the field has it, without sways, of all sizes up to a depth."""
     population = statistics.rain(30.0)
-    if not sways:
-        still = np.zeros_like(population.sway_m)
-        population = replace(population, sway_m=still, sway_per_wind_s=still)
+    still = np.zeros_like(population.sway_m)
+    population = replace(population, sway_m=still, sway_per_wind_s=still)
     this = field(population, wind=wind)
     resolved = this.resolve(cam, 20_000)
     resolved = replace(resolved, reach_m=np.full_like(resolved.reach_m, reach_m))
@@ -167,7 +166,6 @@ def length_alpha_sum(exposure_s, diameter_m, depth_m, drawn):
         length = np.sqrt(12 * (spread[0, 1, 1] - width_px2))
     else:
         length = np.ptp(splats[:, 1]) * len(splats) / (len(splats) - 1)
-    # Parts overlap: what lies over a line across the streak's middle is their opacity there.
     return length, (alpha * area).sum() / length, (alpha * area).sum()
 
 

@@ -37,6 +37,8 @@ DRY_FLAKE_G_PER_CM3_MM = 0.17
 """Density of a dry aggregate is this over its diameter in mm (Holroyd 1971)."""
 WET_FLAKE_G_PER_CM3_MM = 0.72
 """The same of a wet or rimed one (Rasmussen 1999)."""
+RASMUSSEN_FALL_SPEED_M_PER_S = 1.0
+"""Of all dry flakes, in Rasmussen's extinction."""
 SNOW_SWAY_M = 0.06
 SNOW_SWAY_RAD_PER_S = (3.1, 2.2)
 """Of the smallest flakes; larger ones sway slower."""
@@ -209,14 +211,19 @@ def rain_extinction_per_m(rate_mm_per_h: float) -> float:
 
 
 def snow_extinction_per_m(rate_mm_per_h: float, wetness: float = 0.0) -> float:
-    """Silhouette area per volume of all flakes; near 2.46 S per km when dry (Rasmussen 1999).
+    """Silhouette area per volume of all flakes, whatever their sizes: 2.45 S per km when dry.
 
-    Flakes beyond the largest class (3.37 mm melted) count here too: they become veil, not
-    particles.
+    Where the density of a flake times its diameter is a constant C3, its silhouette is 1.5 times
+    its mass over C3. The size law agrees to 5 % from 0.4 to 4 mm/h where it is cut at 6 mm of
+    melted water, as the law of drops is; beyond, no cut serves all rates, this line does. What the
+    classes leave out (flakes under 0.5 mm and over 3.37 mm melted) becomes veil, not particles.
+
+    Source:
+        Rasmussen et al. (1999): 1.5 W / C3, water content W = S / (3.6 v), v = 1 m/s when dry.
     """
-    slope, intercept = gunn_marshall(rate_mm_per_h)
-    third_moment = 6.0 * intercept / (1.0 + wetness) / slope**4
-    return math.pi / 4 * 1e-6 * third_moment / flake_density_g_per_cm3_mm(wetness)
+    fall_speed_m_per_s = RASMUSSEN_FALL_SPEED_M_PER_S * (1.0 + wetness)
+    water_g_per_m3 = rate_mm_per_h / (3.6 * fall_speed_m_per_s)
+    return 1.5 * water_g_per_m3 / (1e3 * flake_density_g_per_cm3_mm(wetness))
 
 
 def _classes(

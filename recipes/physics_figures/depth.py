@@ -37,14 +37,12 @@ def explicit_and_residual(quick: bool) -> tuple[Figure, dict[str, float]]:
             z, drawn / whole, (drawn + veil) / whole, color=LIGHT, lw=0, label="veil"
         )
         upper.axhline(1, color=BLACK, lw=1.1, label="∫ π/4 D² N(D) dD · z")
-        upper.text(
-            0.96, 0.5, f"$α_{{min}}$ = {alpha_min:.3f}", transform=upper.transAxes, ha="right"
-        )
-        upper.set(title=f"budget {budget:,}".replace(",", " "), ylim=(0, 1.12))
+        budget_text = f"{budget:,}".replace(",", " ")
+        upper.set(title=f"budget {budget_text}: $α_{{min}}$ = {alpha_min:.3f}", ylim=(0, 1.12))
         off = 100 * ((drawn + veil) / whole - 1)
         lower.axhline(0, color=BLACK, lw=1.1)
         lower.errorbar(z, off, 100 * error / whole, fmt="o", ms=3.5, mfc="white", color=BLUE, lw=1)
-        lower.set(xscale="log", xlabel="depth, m", xlim=(0.9, 66), ylim=(-4, 4))
+        lower.set(xscale="log", xlabel="depth, m", xlim=(0.9, 66), ylim=(-2.6, 2.6))
         lower.set_xticks([1, 3, 10, 30, 60], ["1", "3", "10", "30", "60"])
         lower.minorticks_off()
         name = f"explicit + residual, budget {budget}"
@@ -54,7 +52,8 @@ def explicit_and_residual(quick: bool) -> tuple[Figure, dict[str, float]]:
         found[f"{name}: share drawn at 60 m, %"] = float(100 * (drawn / whole)[-1])
     axes[0, 0].set(ylabel="share of the whole")
     axes[1, 0].set(ylabel="sum off, %")
-    axes[0, 1].legend(loc="center", bbox_to_anchor=(0.5, 0.68), fontsize=9)
+    legend = axes[0, 0].legend(loc="center", bbox_to_anchor=(0.55, 0.62), frameon=True)
+    legend.get_frame().set(alpha=1, linewidth=0)
     return figure, found
 
 
@@ -110,7 +109,7 @@ def beer_lambert(quick: bool) -> tuple[Figure, dict[str, float]]:
     left.legend(loc="lower left")
     off, ratio = [], []
     for opacity, colour in ((0.05, GREEN), (0.2, BLUE), (0.8, ORANGE)):
-        formula(right, tau, np.sqrt(np.expm1(tau * opacity / 2)))
+        formula(right, tau, np.sqrt(np.expm1(tau * (opacity + 2 / 255) / 2)))
         spread = [_spread(t, opacity, seeds) for t in (0.5, 1.0, 2.0, 3.0)]
         measured(
             right, [0.5, 1, 2, 3], [s[1] for s in spread], f"$α_0$ = {opacity:g}", color=colour
@@ -120,7 +119,7 @@ def beer_lambert(quick: bool) -> tuple[Figure, dict[str, float]]:
     right.set(
         xlabel="optical depth τ", ylabel="standard deviation / mean", xlim=(0, 3.4), ylim=(0, 1.65)
     )
-    right.set(title="Spread: $\\sqrt{\\exp(τ α_0/2) − 1}$")
+    right.set(title="Spread: $\\sqrt{\\exp(τ (α_0 + 2/255) / 2) − 1}$")
     right.legend(loc="upper left")
     return figure, {
         "Beer-Lambert, discs: largest deviation of the mean, %": 100
@@ -166,10 +165,12 @@ def _disc_mean(tau: float, seeds: int) -> float:
 def _spread(tau: float, opacity: float, seeds: int) -> tuple[float, float, float]:
     """Of wide splats: mean over the expected one, standard deviation over mean, and expected."""
     cam = scenes.camera(480, 288, 600.0, aperture_m=0.0)
-    shots = _poisson(cam, tau, opacity, 0.06, max(1, seeds // 2))
+    shots = _poisson(cam, tau, opacity, 0.06, seeds if opacity < 0.5 else 3 * seeds)
     path = tau * scenes.slants(cam)
     relative = shots / np.exp(-path)
-    expected = np.sqrt(np.expm1(path * opacity / 2).mean())
+    # A splat of peak a + 1/255 that ends where it has fallen to 1/255 has the integral 2 pi s^2 a,
+    # and its square pi s^2 a (a + 2/255).
+    expected = np.sqrt(np.expm1(path * (opacity + 2 / 255) / 2).mean())
     return float(relative.mean()), float(relative.std() / relative.mean()), float(expected)
 
 

@@ -83,14 +83,7 @@ def _height(axes: scenes.Any) -> dict[str, float]:
         tau = optical_depth(depth, scenes.whole(cam), optics, medium, carried, even_fog())[:, 0]
         beta = np.log(20) / 150.0
         rows = np.arange(100, 336, 5)
-        exact = np.array(
-            [
-                beta
-                * np.sqrt(1 + slope[i] ** 2)
-                * quad(lambda z, i=i: np.exp(-z * slope[i] / height_m), 0, 200)[0]
-                for i in rows
-            ]
-        )
+        exact = np.array([beta * _layer_m(slope[i], height_m) for i in rows])
         inside = (exact < 60) & (200 * slope[rows] / height_m > -8)
         worst = max(worst, float(np.abs(tau[rows] / exact - 1)[inside].max()))
         formula(axes, elevation[rows], exact)
@@ -100,6 +93,12 @@ def _height(axes: scenes.Any) -> dict[str, float]:
     axes.set(title="Fog that thins with height", ylim=(0.3, 30), xlim=(-5, 23))
     axes.legend(loc="upper right")
     return {"height fog: largest deviation from quadrature, %": 100 * worst}
+
+
+def _layer_m(slope: float, height_m: float) -> float:
+    """Metres of fog as dense as at the camera along 200 m of depth of a ray that climbs."""
+    along = quad(lambda z: np.exp(-z * slope / height_m), 0, 200)[0]
+    return float(np.sqrt(1 + slope**2) * along)
 
 
 def _published(axes: scenes.Any, quick: bool) -> dict[str, float]:

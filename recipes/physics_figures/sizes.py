@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -14,11 +15,11 @@ from weather_aug.particles import statistics
 from weather_aug.particles.resolve import NEAR_M, Resolved
 
 GUNN_KINZER_MM = np.r_[np.arange(0.4, 1.01, 0.1), np.arange(1.2, 5.81, 0.2)]
-GUNN_KINZER_M_PER_S = np.array(
-    [1.62, 2.06, 2.47, 2.87, 3.27, 3.67, 4.03, 4.64, 5.17, 5.65, 6.09, 6.49, 6.90, 7.27, 7.57]
-    + [7.82, 8.06, 8.26, 8.44, 8.60, 8.72, 8.83, 8.92, 8.98, 9.03, 9.07, 9.09, 9.12, 9.14]
-    + [9.16, 9.17]
-)
+GUNN_KINZER_M_PER_S = np.r_[
+    [1.62, 2.06, 2.47, 2.87, 3.27, 3.67, 4.03, 4.64, 5.17, 5.65, 6.09, 6.49, 6.90, 7.27, 7.57],
+    [7.82, 8.06, 8.26, 8.44, 8.60, 8.72, 8.83, 8.92, 8.98, 9.03, 9.07, 9.09, 9.12, 9.14],
+    [9.16, 9.17],
+]
 """Measured speeds of drops in still air (Gunn and Kinzer 1949)."""
 REACH_M = 6.0
 
@@ -105,7 +106,7 @@ def _measured_speeds(cam: scenes.Camera, law: str) -> tuple[np.ndarray, np.ndarr
     return np.array(middles), np.array(speeds)
 
 
-def _speeds(axes: scenes.Any, cam: scenes.Camera) -> None:
+def _speeds(axes: Any, cam: scenes.Camera) -> None:
     axes.plot(GUNN_KINZER_MM, GUNN_KINZER_M_PER_S, "k.", ms=4, label="Gunn, Kinzer 1949: measured")
     middle, speed = _measured_speeds(cam, "brandes")
     measured(axes, middle, speed, "drawn drops (default law)", color=BLUE)

@@ -12,7 +12,6 @@ from weather_aug.render.compose import render
 from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
 
-
 DISCS_TAU = 0.05
 
 
@@ -81,13 +80,18 @@ def _rendered(scales: scenes.Float, seeds: int) -> dict[str, scenes.Float]:
     for scale in scales:
         cam = full.resized(round(480 * scale), round(288 * scale))
         shots = [
-            render(scenes.wall(cam, 25.0, 60), weather, seed=s, ambience=scenes.AMBIENCE)
+            render(scenes.wall(cam, 25.0, _ramp(cam)), weather, seed=s, ambience=scenes.AMBIENCE)
             for s in range(seeds)
         ]
         found["mean transmittance"].append(np.mean([s.transmittance for s in shots]))
         light = [linear_from_srgb(s.image / 255.0).mean() for s in shots]
         found["mean linear light"].append(np.mean(light))
     return {name: np.array(values) for name, values in found.items()}
+
+
+def _ramp(cam: scenes.Camera) -> scenes.Float:
+    """Levels from 40 to 160 across the picture: an even wall would measure the rounding."""
+    return np.asarray(40 + 120 * (np.arange(cam.width) + 0.5) / cam.width)
 
 
 def extinction(quick: bool) -> tuple[Figure, dict[str, float]]:

@@ -134,6 +134,7 @@ def _focus(axes: scenes.Any, quick: bool) -> dict[str, float]:
         highest = min(highest, aim[1])
     axes.set(xlim=(0, size[0]), ylim=(size[1], highest - 0.12 * size[1]), xticks=[], yticks=[])
     axes.grid(visible=False)
+    axes.spines[["left", "bottom"]].set_visible(False)
     axes.set(title="Aims of motion (○), of streaks (+)")
     axes.legend(loc="upper left", bbox_to_anchor=(-0.02, 1.0), handletextpad=0.2)
     return {

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from matplotlib.figure import Figure
 
 from physics_figures import scenes
-from physics_figures.style import BLUE, GREEN, GREY, ORANGE, formula, measured, panels
+from physics_figures.style import BLUE, GREEN, GREY, ORANGE, PURPLE, formula, measured, panels
 from weather_aug.colour import linear_from_srgb
 from weather_aug.render.compose import render
 from weather_aug.render.options import RenderOptions
@@ -36,9 +38,10 @@ def resolution(quick: bool) -> tuple[Figure, dict[str, float]]:
     left.set(title="6 mm discs from 1 to 12 m")
     left.set_yticks([1, 3, 10, 30, 100, 300], ["1", "3", "10", "30", "100", "300"])
     left.legend(loc="upper right")
+    looks = ((BLUE, "o"), (GREEN, "s"), (PURPLE, "x"))
     rendered = _rendered(scales, 1 if quick else 4)
-    for (name, values), colour in zip(rendered.items(), (BLUE, GREEN), strict=True):
-        measured(right, scales, values / values[-1], name, color=colour)
+    for (name, values), (colour, marker) in zip(rendered.items(), looks, strict=True):
+        measured(right, scales, values / values[-1], name, color=colour, marker=marker)
     right.axhline(1, color="#222222", lw=1.1)
     right.set(ylabel="relative to the finest", ylim=(0.98, 1.02), title="Snow 4 mm/h, `render`")
     right.legend(loc="upper right")
@@ -73,19 +76,24 @@ def _discs(cam: scenes.Camera) -> scenes.Float:
 
 
 def _rendered(scales: scenes.Float, seeds: int) -> dict[str, scenes.Float]:
-    """Mean transmittance and mean linear light of a grey wall behind snow, at each resolution."""
+    """Means of a grey wall behind snow, at each resolution."""
     full = scenes.camera(480, 288, 360.0, 8.0, exposure_s=0.005)
     weather = Weather(snow_mm_per_h=4.0)
-    found: dict[str, list[float]] = {"mean transmittance": [], "mean linear light": []}
+    # 0.45 (sky + ground) is the airlight: flakes and veil look the same.
+    alike = replace(scenes.AMBIENCE, sky=np.full(3, 0.9), ground=np.full(3, 0.6 / 0.45 - 0.9))
+    names = ("mean transmittance", "mean linear light", "the same, flakes as airlight")
+    found: dict[str, list[float]] = {name: [] for name in names}
     for scale in scales:
         cam = full.resized(round(480 * scale), round(288 * scale))
-        shots = [
-            render(scenes.wall(cam, 25.0, _ramp(cam)), weather, seed=s, ambience=scenes.AMBIENCE)
-            for s in range(seeds)
-        ]
-        found["mean transmittance"].append(np.mean([s.transmittance for s in shots]))
-        light = [linear_from_srgb(s.image / 255.0).mean() for s in shots]
-        found["mean linear light"].append(np.mean(light))
+        frame = scenes.wall(cam, 25.0, _ramp(cam))
+        plain, matched = (
+            [render(frame, weather, seed=s, ambience=light) for s in range(seeds)]
+            for light in (scenes.AMBIENCE, alike)
+        )
+        found[names[0]].append(np.mean([s.transmittance for s in plain]))
+        for name, shots in ((names[1], plain), (names[2], matched)):
+            light = [linear_from_srgb(s.image / 255.0).mean() for s in shots]
+            found[name].append(np.mean(light))
     return {name: np.array(values) for name, values in found.items()}
 
 

@@ -10,7 +10,7 @@ import io
 import time
 from pathlib import Path
 
-from physics_figures import depth, fog, motion, sizes, streaks, strength
+from physics_figures import depth, fog, motion, severity, sizes, streaks, strength
 from PIL import Image
 
 FIGURES = {
@@ -23,7 +23,7 @@ FIGURES = {
     "07_fog": fog.fog,
     "08_stationarity": motion.stationarity,
     "09_gusts": motion.gusts,
-    "10_severity": strength.severity,
+    "10_severity": severity.severity,
 }
 
 

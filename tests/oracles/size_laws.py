@@ -7,6 +7,7 @@ conventions of the field and no laws.
 from itertools import pairwise
 
 import numpy as np
+from scipy import stats
 
 from weather_aug.particles import statistics
 from weather_aug.particles.resolve import FAR_M, NEAR_FULL_M, NEAR_M
@@ -87,11 +88,25 @@ def abrupt(depth_m, limit_m):
     return ((depth_m > NEAR_M) & (depth_m < limit_m)).astype(float)
 
 
-def _drawn_sizes(population, rate, camera, alpha):
-    """(weight, D, limit) of every size that is drawn."""
-    for streak, (weights, diameters) in zip(
-        streaks_m(population, camera), sizes(population.kind, rate), strict=True
+def arrived(mean):
+    """Mean opacity of a cube's particles while the latest ones of it are still appearing."""
+    width = 0.25 + 0.1 * mean
+    count = np.arange(1, int(mean + 12 * np.sqrt(mean) + 40))
+    f = (np.arange(400) + 0.5) / 400
+    lost = np.maximum(0, 1 - (np.arange(40)[:, None] + f) / width).mean(axis=1)
+    per_count = np.cumsum(lost)[np.minimum(count, 40) - 1]
+    return 1 - (stats.poisson.pmf(count, mean) * per_count).sum() / mean
+
+
+def _drawn_sizes(population, rate, camera, alpha, share=arrived):
+    """(weight, D, limit) of every size that is drawn; `share` of a cube's mean count weighs it."""
+    for streak, cell_m, (weights, diameters) in zip(
+        streaks_m(population, camera),
+        population.cell_m,
+        sizes(population.kind, rate),
+        strict=True,
     ):
+        weights = weights * share(weights.sum() * cell_m**3)
         for weight, diameter in zip(weights, diameters, strict=True):
             limit = min(reach_m(diameter, streak, camera.focal_px[0], alpha), FAR_M)
             if limit > NEAR_FULL_M / 0.85:
@@ -113,5 +128,5 @@ def drawn_count(population, rate, camera, alpha):
     solid = camera.width * camera.height / (fx * fy)
     return sum(
         weight * solid * (limit**3 - NEAR_M**3) / 3
-        for weight, _, limit in _drawn_sizes(population, rate, camera, alpha)
+        for weight, _, limit in _drawn_sizes(population, rate, camera, alpha, lambda mean: 1)
     )

@@ -17,6 +17,7 @@ from scipy import stats
 from weather_aug.air import Air
 from weather_aug.errors import ArgumentError
 from weather_aug.particles import kernels, statistics
+from weather_aug.particles import resolve as resolving
 from weather_aug.particles.field import ParticleField
 from weather_aug.particles.resolve import NEAR_M
 
@@ -234,8 +235,9 @@ def test_far_from_the_origin_and_late_the_field_is_as_precise():
     assert nearest(moved[stays], after[:, :3]).max() < 1e-3
 
 
-def test_particles_fade_before_they_end():
+def test_particles_fade_before_they_end(monkeypatch):
     """Opacity falls to 0 at the reach and at the near limit, and is 1 between."""
+    monkeypatch.setattr(resolving, "ARRIVALS", (1e-12, 0.0))
     population, cam = statistics.snow(2.0), camera(width=400, height=300)
     resolved = field(population).resolve(cam, 50_000)
     resolved = replace(resolved, reach_m=np.full_like(resolved.reach_m, 4.0))
@@ -244,6 +246,34 @@ def test_particles_fade_before_they_end():
     expected = np.minimum(np.minimum((depth - 0.5) / 0.2, (4.0 - depth) / 0.6), 1.0)
     np.testing.assert_allclose(opacity, expected, atol=1e-5)
     assert opacity.min() < 0.02 and (opacity == 1).mean() > 0.5
+
+
+@pytest.mark.parametrize("arrivals", [resolving.ARRIVALS, (0.25, 0.0), (1e-12, 0.0)])
+def test_what_a_rising_rate_adds_is_faint_at_first(arrivals, monkeypatch):
+    """Rain 1 % heavier: no opacity rises by more than the ramp allows; without one it does."""
+    monkeypatch.setattr(resolving, "ARRIVALS", arrivals)
+    cam = camera(width=400, height=300)
+    reach_m = np.full((14, 16), 8.0, np.float32)
+    resolved = replace(field(statistics.rain(20.0)).resolve(cam, 1_000), reach_m=reach_m)
+    few, many = (seen(statistics.rain(rate), cam, 2.0, resolved) for rate in (20.0, 20.2))
+    before = {tuple(row[:3]): row[12] for row in few}
+    rise = np.array([row[12] - before.get(tuple(row[:3]), 0.0) for row in many])
+    assert len(many) > len(few)
+    assert (rise.max() < 0.2) == (arrivals[1] > 0)
+
+
+@pytest.mark.parametrize("population", [statistics.rain(75.0), statistics.snow(0.5)])
+def test_the_arrivals_cost_the_opacity_that_the_veil_takes_over(population):
+    cam = camera(width=300, height=200)
+    reach_m = np.full((len(population.cell_m), 16), 6.0, np.float32)
+    resolved = replace(field(population).resolve(cam, 1_000), reach_m=reach_m)
+    expected = resolving.drawn_share(population.mean_per_cell)
+    assert ((expected > 0.8) & (expected < 1)).all()
+    found = [seen(population, cam, t, resolved) for t in (0.0, 40.0, 80.0)]
+    found = np.concatenate([f[(f[:, 2] > 1) & (f[:, 2] < 5)] for f in found])
+    weight = population.density_per_m3 / population.density_per_m3.sum()
+    assert found[:, 12].mean() == pytest.approx(weight @ expected, abs=0.01)
+    assert found[:, 12].mean() < 0.995
 
 
 def test_bad_arguments_are_named():

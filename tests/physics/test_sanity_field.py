@@ -183,7 +183,7 @@ def check_torch_path(device, dtype=torch.float32, shifted=0.0):
     cam = camera(speed=8.0, width=320, height=192, exposure_s=0.004)
     records = Field(1).particles(cam, 1.0, "rain")
     records = records[(records[:, 12] == 1.0) & inside(records, cam)][:3_000]
-    air = AirColumn(0.0, 0.0, 0.0, 0.0, torch.zeros(1025, device=device), 60 / 1024, (0, -1, 0))
+    air = AirColumn(*(0.0,) * 4, 60 / 1024, 0.0, 3.0, torch.zeros(1025, device=device), (0, -1, 0))
     white = torch.ones(3, device=device)
     rows = torch.from_numpy(records + np.float32(shifted)).to(device, dtype)
     blocks = splats_of_records(records, cam)[:, :2].astype(float)

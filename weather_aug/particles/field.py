@@ -26,11 +26,11 @@ from weather_aug.clip.types import Camera
 from weather_aug.errors import ArgumentError
 from weather_aug.particles import kernels
 from weather_aug.particles.resolve import (
-    ARRIVAL_SHARE,
     FADE_SHARE,
     NEAR_FULL_M,
     NEAR_M,
     Resolved,
+    arrivals,
     resolve,
 )
 from weather_aug.particles.statistics import Population
@@ -119,7 +119,7 @@ class ParticleField:
         inputs = (
             _class_keys(population.kind, self.seed, len(pad_m)),
             _counts(tuple(population.mean_per_cell)),
-            ARRIVAL_SHARE,
+            arrivals(population.mean_per_cell),
             population.cell_m,
             field_from_camera[:3, 3] - self._carried_m(time_s),
             *_planes_and_bounds(turned, tangents, reach_m, pad_m, sway_m, population.cell_m),

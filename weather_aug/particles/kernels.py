@@ -222,7 +222,7 @@ def _turn(word, turns):
 
 @compiled
 def scatter(
-    class_keys, counts, arrival_share, cell_m, origin_m, planes, bounds, view, motion, looks, out
+    class_keys, counts, arrivals, cell_m, origin_m, planes, bounds, view, motion, looks, out
 ):
     """Enumerate the particles that a camera can resolve, in camera axes.
 
@@ -230,14 +230,14 @@ def scatter(
     drifting frame, is cut into cubes, and the content of a cube is a hash of its index. How many
     particles a cube holds is a quantile of the Poisson distribution at the cube's own uniform
     number, and where the n-th of them is does not depend on how many there are: a higher density
-    adds particles and moves none. The last one of a cube is faint where the cube has only just got
-    it, so that none pops up while the density rises.
+    adds particles and moves none. The latest ones of a cube are faint, so that none pops up while
+    the density rises.
 
     Args:
         class_keys: (C,) uint64.
         counts: (C, K) uint64, the distribution function of the count of a cube times 2^64; the
             last is the largest word.
-        arrival_share: Share of the probability of a count over which its last particle appears.
+        arrivals: (C,) how many later particles a cube must have room for until one is fully there.
         cell_m: (C,) side of a cube.
         origin_m: (C, 3) camera position minus the drift of the class, field axes, float64.
         planes: (C, 6, 4) planes of the padded view, field axes about the camera: normals point
@@ -265,6 +265,7 @@ def scatter(
         if view.reach_m[c, sizes - 1] <= view.near_m:
             continue
         cell = cell_m[c]
+        per_arrival = 1.0 / arrivals[c]
         swing = motion.sway_m[c, 0] + motion.sway_m[c, 1]
         wide = view.pad_m[c] + swing * (1.0 + steepest)
         near = view.near_m - swing
@@ -302,11 +303,11 @@ def scatter(
                     corner_y = r[1, 0] * px + r[1, 1] * py + r[1, 2] * pz
                     corner_z = r[2, 0] * px + r[2, 1] * py + r[2, 2] * pz
                     slot = key
-                    last = 1.0
+                    later = 1.0
                     if many > 0:
                         before = counts[c, many - 1]
-                        band = np.float64(counts[c, many] - before) * arrival_share
-                        last = min(np.float64(key - before) / band, 1.0)
+                        later = np.float64(key - before) / np.float64(counts[c, many] - before)
+                    later += many
                     for n in range(many):
                         slot += GOLDEN
                         word = mix64(slot)
@@ -322,7 +323,7 @@ def scatter(
                         passes &= (y >= top * z - wide) & (y <= bottom * z + wide)
                         words[fill] = word
                         places[fill, 0], places[fill, 1], places[fill, 2] = x, y, z
-                        places[fill, 3] = last if n == many - 1 else 1.0
+                        places[fill, 3] = min((later - (n + 1)) * per_arrival, 1.0)
                         fill += int(passes)
                     if fill >= BUFFER:
                         found = _record(c, words, places, fill, view, motion, looks, found, out)

@@ -2,12 +2,13 @@
 
 A particle is drawn where its pixel opacity is at least `alpha_min`; the rest of the population is a
 veil in closed form, so that the optical depth of both together is right at any particle budget.
-Drawn particles fade in behind the near limit, out before their reach, and in when the density rises,
-so that none pops up; the veil accounts for that too.
+Drawn particles fade in behind the near limit, out before their reach, and in when the density
+rises, so that none pops up; the veil accounts for that too.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -24,9 +25,9 @@ NEAR_FULL_M = 0.7
 """The opacity of particles rises from 0 at the near limit to its full value here."""
 FADE_SHARE = 0.15
 """Share of its reach, at the end, over which the opacity of a particle falls to 0."""
-ARRIVAL_SHARE = 0.25
-"""Share of the probability of a count over which the last particle of a hash cell appears when the
-density rises: at any moment an eighth of the last particles' opacity is missing."""
+ARRIVALS = (0.25, 0.1)
+"""While the density rises, a particle of a hash cell of mean count m appears over the arrival of
+this many later ones: 0.25 + 0.1 m. Dense cells thus let theirs appear over a tenth of the rate."""
 LEAST_REACH_M = NEAR_FULL_M / (1.0 - FADE_SHARE)
 """A size with a shorter reach is not drawn, so that the two fades never overlap."""
 FAR_M = 60.0
@@ -77,7 +78,7 @@ def resolve(
         np.shape(population.diameters_m),
         population.diameters_m.tobytes(),
         population.density_per_m3.tobytes(),
-        _drawn_share(population.mean_per_cell).tobytes(),
+        drawn_share(population.mean_per_cell).tobytes(),
         np.ascontiguousarray(relative_m_per_s, np.float64).tobytes(),
         picture,
         camera.exposure_s,
@@ -123,14 +124,29 @@ def _resolved(
     return Resolved(alpha_min, reach_m, count, optical_depth)
 
 
-def _drawn_share(mean_per_cell: Float64) -> Float64:
-    """Share (C,) of the opacity that the last particles of the cells leave, on average.
+def arrivals(mean_per_cell: Float64) -> Float64:
+    """Later particles (C,) that a hash cell must have room for until one is fully there."""
+    least, share = ARRIVALS
+    width: Float64 = least + share * np.asarray(mean_per_cell)
+    return width
 
-    A cell of n particles lacks half of `ARRIVAL_SHARE` if n > 0, which is so with probability
-    1 - exp(-mean).
+
+def drawn_share(mean_per_cell: Float64) -> Float64:
+    """Share (C,) of the opacity that the arrival of the latest particles leaves, on average.
+
+    Of a cell's n particles the one with j later ones is (j + f) / w there, at most 1, with f
+    uniform and w = `arrivals`; there is one with probability P(n > j) of the Poisson law.
     """
-    mean = np.maximum(mean_per_cell, 1e-12)
-    share: Float64 = 1.0 + 0.5 * ARRIVAL_SHARE * np.expm1(-mean) / mean
+    mean = np.maximum(mean_per_cell, 1e-9)[:, None]
+    width = arrivals(mean)
+    later = np.arange(math.ceil(width.max()))
+    end = np.clip(width, later, later + 1)
+    missing = (end - later) - (end**2 - later**2) / (2 * width)
+    log_factorial = np.array([math.lgamma(j + 1) for j in later])
+    up_to = np.exp(later * np.log(mean) - mean - log_factorial).cumsum(axis=1)
+    # Of nearly empty cells 1 - exp(-m) would lose its digits.
+    more = np.where(later == 0, -np.expm1(-mean), np.maximum(1.0 - up_to, 0.0))
+    share: Float64 = 1.0 - (more * missing).sum(axis=1) / mean[:, 0]
     return share
 
 

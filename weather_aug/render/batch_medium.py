@@ -117,13 +117,11 @@ def layer_share(heights: Tensor) -> Tensor:
 def spray_share(heights: Tensor, camera_heights: float) -> Tensor:
     """Mean density along a ray that climbs by `heights` scale heights, over that at the road.
 
-    The layer is as dense below the road's plane as on it; see `medium.spray_share`.
+    There is none below the road's plane; see `medium.spray_share`.
     """
-    at_camera = math.exp(-camera_heights)
-    above = at_camera * layer_share(heights.clamp(min=-camera_heights))
-    under = (1.0 + camera_heights / heights.clamp(max=-0.01)).clamp(min=0.0)
-    under = under.masked_fill(heights >= -camera_heights, 0.0)
-    return above + under * (1.0 - above)
+    above = math.exp(-camera_heights) * layer_share(heights.clamp(min=-camera_heights))
+    share = -camera_heights / heights.clamp(max=-0.01)
+    return above * share.masked_fill(heights >= -camera_heights, 1.0)
 
 
 def pixel_rays(camera: Camera, like: Tensor) -> tuple[Tensor, Tensor]:

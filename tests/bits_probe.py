@@ -26,6 +26,7 @@ from weather_aug.render.compose import RenderedFrame, render
 from weather_aug.render.fields import RigMotion
 from weather_aug.render.light import ambience_of
 from weather_aug.render.options import RenderOptions
+from weather_aug.render.surface import Surface, depth_of
 from weather_aug.taxonomy import BUILDING, ROAD, SKY
 from weather_aug.weather import Weather
 
@@ -133,13 +134,16 @@ def canaries() -> dict[str, str]:
 @contextlib.contextmanager
 def fault() -> Iterator[None]:
     """Let numpy's exp, whose last bit depends on the CPU, draw every pixel's depth."""
-    whole = stage.Stage._run
+    read = stage.Stage._run
 
-    def faulty(self: stage.Stage, *arguments: Any) -> stage.Planes:
-        logarithm = np.log(np.minimum(self.depth, 1e4).astype(np.float64))
-        jittered = (np.exp(logarithm) * 2.0**45 % 1.0).astype(np.float32) + self.depth
-        object.__setattr__(self, "depth", jittered)
-        return whole(self, *arguments)
+    def faulty(self: stage.Stage, surface: Surface, *arguments: Any) -> stage.Planes:
+        whole = (0, 0, len(surface.image) // surface.width, surface.width)
+        depth = depth_of(surface, whole).reshape(-1)
+        logarithm = np.log(np.minimum(depth, 1e4).astype(np.float64))
+        jittered = (np.exp(logarithm) * 2.0**45 % 1.0).astype(np.float32) + depth
+        jittered.flags.writeable = False
+        surface = surface._replace(single=jittered, half=surface.half[:0])
+        return read(self, surface, *arguments)
 
     with mock.patch.object(stage.Stage, "_run", faulty):
         yield

@@ -203,7 +203,10 @@ def _trimmed(shot: Planes, frame: Frame, outer: Window, window: Window) -> Rende
     invalid = np.zeros(window[2:], np.uint8)
     if shot.hazy_count or shot.covered.any():
         seen = np.zeros_like(shot.covered) if frame.label is None else frame.label[_part(outer)]
-        planes = readable_labels(cut(seen), shot.transmittance, shot.distinct, shot.covered)
+        # A copy, because the kernel would be compiled once more for what may not be written.
+        planes = readable_labels(
+            np.array(seen, order="C"), shot.transmittance, shot.distinct, shot.covered
+        )
         invalid = cut(planes[1][part])
         honest = None if full is None else cut(planes[0][part])
     return RenderedFrame(

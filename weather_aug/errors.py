@@ -73,7 +73,13 @@ class MissingExtraError(WeatherAugError, ImportError):
 
 
 def printable(value: object, limit: int = 80) -> str:
-    """Text for an error message: control characters escaped, cut to `limit` characters."""
+    """Text for an error message: control characters escaped, at most `limit` characters.
+
+    What is too long loses its middle, because a path says most at its end.
+    """
     text = str(value)
     text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
-    return text if len(text) <= limit else text[: limit - 1] + "…"
+    if len(text) <= limit:
+        return text
+    head = limit // 3
+    return text[:head] + "…" + text[head + 1 - limit :]

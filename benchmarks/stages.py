@@ -19,7 +19,7 @@ from weather_aug.particles.field import ParticleField
 from weather_aug.render import compose, fields, stage
 
 STAGES: dict[str, tuple[Any, str]] = {
-    "cut": (compose, "_cut"),
+    "read": (compose, "surface_of"),
     "air": (compose, "air_of"),
     "resolve": (ParticleField, "resolve"),
     "enumerate": (ParticleField, "particles"),

@@ -91,7 +91,7 @@ class AirColumn:
             tau = tau + self.spray_per_m * spray * z_m
         if self.precipitation_per_m > 0.0:
             last = self.resolved_depth.shape[0] - 1
-            step = (z_m / self.resolved_step_m).clamp(max=last).long()
+            step = (z_m / self.resolved_step_m + 0.5).clamp(max=last).long()
             rest = self.precipitation_per_m * z_m - self.resolved_depth.to(z_m.dtype)[step]
             tau = tau + rest.clamp(min=0.0)
         return (tau * slant).clamp(max=THICKEST)

@@ -102,22 +102,30 @@ def spray_share(heights, camera_heights):
     There is no spray below the road's plane: a road that falls away, or noise in the depth, must
     not run into a layer that grows without end.
     """
-    zero, one = np.float32(0.0), np.float32(1.0)
+    one, highest, nearly = np.float32(1.0), np.float32(80.0), np.float32(0.05)
     lowest = -camera_heights
-    above = survival(camera_heights) * layer_share(heights if heights > lowest else lowest)
-    deeper = heights if heights < np.float32(-0.01) else np.float32(-0.01)
-    share = lowest / deeper
-    return above * (share if (heights < lowest) & (share > zero) else one)
+    h = heights if heights > lowest else lowest
+    thin = abs(h) < nearly
+    away = nearly if thin else h
+    length = away if heights > lowest else heights
+    share = (one - survival(away if away < highest else highest)) / length
+    return survival(camera_heights) * (_mean_of_thin_layer(h) if thin else share)
 
 
 @inlined
 def carried_at(z, resolved_depth, medium):
     """Optical depth of drawn particles, on the axis, up to depth z."""
+    return resolved_depth[_bin_of(z, resolved_depth, medium)]
+
+
+@inlined
+def _bin_of(z, resolved_depth, medium):
+    """Nearest entry of the table at depth z."""
     last = np.float32(resolved_depth.shape[0] - 1)
-    position = z * (np.float32(1.0) / medium.resolved_step_m)
+    position = z * (np.float32(1.0) / medium.resolved_step_m) + np.float32(0.5)
     # Compared as a float first: the sky's bin does not fit an integer's range on every machine.
     position = position if position < last else last
-    return resolved_depth[np.int32(position)]
+    return np.uint32(np.int32(position))
 
 
 @inlined
@@ -164,7 +172,9 @@ def reach_row(depth, ray_x, ray_y, optics, slant, reach):
 
 
 @compiled
-def transmittance_row(ray_x, ray_y, slant, share, optics, medium, resolved_depth, tau, out):
+def transmittance_row(
+    ray_x, ray_y, slant, share, optics, medium, resolved_depth, place, carried, tau, out
+):
     """Optical depth of the air before each pixel of a row and what of the light survives it.
 
     Args:
@@ -175,10 +185,12 @@ def transmittance_row(ray_x, ray_y, slant, share, optics, medium, resolved_depth
         optics: Camera.
         medium: Air.
         resolved_depth: Optical depth of resolved particles by depth.
+        place: (W,) uint32 work space.
+        carried: (W,) float32 work space.
         tau: (W,) out: optical depth.
         out: (W,) depth at which the air ends in, transmittance out.
     """
-    zero, one = np.float32(0.0), np.float32(1.0)
+    zero = np.float32(0.0)
     width = out.shape[0]
     for x in range(width):
         tau[x] = medium.fog_per_m * out[x] * slant[x]
@@ -199,12 +211,13 @@ def transmittance_row(ray_x, ray_y, slant, share, optics, medium, resolved_depth
             spray = spray_share(climb, medium.camera_heights)
             tau[x] += medium.spray_per_m * spray * out[x] * slant[x]
     if medium.precipitation_per_m > zero:
-        last = np.float32(resolved_depth.shape[0] - 1)
-        per_metre = one / medium.resolved_step_m
+        # In three loops, because a look-up among other things would keep all of them slow.
         for x in range(width):
-            position = out[x] * per_metre
-            position = position if position < last else last
-            rest = medium.precipitation_per_m * out[x] - resolved_depth[np.int32(position)]
+            place[x] = _bin_of(out[x], resolved_depth, medium)
+        for x in range(width):
+            carried[x] = resolved_depth[place[x]]
+        for x in range(width):
+            rest = medium.precipitation_per_m * out[x] - carried[x]
             tau[x] += (rest if rest > zero else zero) * slant[x]
     most = np.float32(60.0)
     for x in range(width):
@@ -221,7 +234,7 @@ def optical_depth(depth, window, optics, medium, resolved_depth, patches):
         ray_x[x] = (np.float32(x + left) - optics.cx) / optics.fx
     patchy = patches.share.shape[0] > 0
     nodes = np.empty(patches.share.shape[0] * patches.share.shape[2], np.float32)
-    place = np.empty(width if patchy else 0, np.uint32)
+    place, carried = np.empty(width, np.uint32), np.empty(width, np.float32)
     share = np.empty(width if patchy else 0, np.float32)
     slant, reach = np.empty(width, np.float32), np.empty(width, np.float32)
     tau = np.empty((height, width), np.float32)
@@ -230,5 +243,17 @@ def optical_depth(depth, window, optics, medium, resolved_depth, patches):
         reach_row(depth[y], ray_x, ray_y, optics, slant, reach)
         if patchy:
             share_row(patches, y + top, left, reach, nodes, place, share)
-        transmittance_row(ray_x, ray_y, slant, share, optics, medium, resolved_depth, tau[y], reach)
+        transmittance_row(
+            ray_x,
+            ray_y,
+            slant,
+            share,
+            optics,
+            medium,
+            resolved_depth,
+            place,
+            carried,
+            tau[y],
+            reach,
+        )
     return tau

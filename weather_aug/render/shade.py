@@ -66,7 +66,7 @@ def shade(
         band_starts: (bands + 1,) where each band's splats start.
         limits: Linear difference from the airlight that can just be seen, and the transmittance
             below which a surface must differ from it to be seen.
-        out: (3, H, W) uint8 out.
+        out: (3, H, W rounded up to a multiple of 16) uint8 out.
         through: (H, W) float32 out: transmittance of air and particles.
         distinct: (H, W) uint8 out: 1 where what is left of a surface's difference from the
             airlight can be seen.
@@ -78,24 +78,26 @@ def shade(
     """
     top, left, height, width = window
     least_contrast, hazy = limits
-    ray_x = np.empty(width, np.float32)
-    for x in range(width):
+    # Rows of whole vectors: the few pixels that would be left over cost as much as hundreds.
+    wide = (width + 15) // 16 * 16
+    ray_x = np.empty(wide, np.float32)
+    for x in range(wide):
         ray_x[x] = (np.float32(x + left) - optics.cx) / optics.fx
     # Red, green, blue, transmittance and depth of a band's rows side by side. The odd stride keeps
     # them apart in the cache: planes of equal page offset would evict each other at every pixel.
-    # It is a multiple of 4 beyond the width, so that tiles fit.
-    stride = (width + 15) // 16 * 16 + 80
-    planes = np.zeros((BAND_ROWS, 5, stride), np.float32)
+    stride = wide + 80
+    planes = np.ones((BAND_ROWS, 5, stride), np.float32)
     bits = planes.view(np.int32)
     tiles = np.empty((BAND_ROWS // 4, stride // 4, TILE_FLOATS), np.float32)
     patchy = patches.share.shape[0] > 0
     nodes = np.empty(patches.share.shape[0] * patches.share.shape[2], np.float32)
-    place = np.empty(width if patchy else 0, np.uint32)
-    share = np.empty(width if patchy else 0, np.float32)
-    gap = np.empty((BAND_ROWS, width), np.float32)
-    sky = np.empty((BAND_ROWS, width), np.uint8)
-    tau = np.empty(width, np.float32)
-    slant = np.empty(width, np.float32)
+    place, carried = np.empty(wide, np.uint32), np.empty(wide, np.float32)
+    share = np.ones(wide if patchy else 0, np.float32)
+    gap = np.empty((BAND_ROWS, wide), np.float32)
+    sky = np.zeros((BAND_ROWS, wide), np.uint8)
+    shown = np.zeros(wide, np.uint8)
+    tau = np.empty(wide, np.float32)
+    slant = np.empty(wide, np.float32)
     overcast = tone.overcast > np.float32(0.0)
     hidden = 0
     for band in range(band_starts.shape[0] - 1):
@@ -104,26 +106,34 @@ def shade(
         for y in range(y0, y1):
             k = y - y0
             ray_y = (np.float32(y + top) - optics.cy) / optics.fy
-            red, green, blue = planes[k, 0, :width], planes[k, 1, :width], planes[k, 2, :width]
-            clear, depth = planes[k, 3, :width], planes[k, 4, :width]
-            depth_row(surface, y + top, left, bits[k, 4, :width], depth)
-            sky_row(surface, y + top, left, sky[k])
+            red, green, blue = planes[k, 0, :wide], planes[k, 1, :wide], planes[k, 2, :wide]
+            clear, depth = planes[k, 3, :wide], planes[k, 4, :wide]
+            depth_row(surface, y + top, left, bits[k, 4, :width], depth[:width])
+            sky_row(surface, y + top, left, sky[k, :width])
             reach_row(depth, ray_x, ray_y, optics, slant, clear)
             if patchy:
-                share_row(patches, y + top, left, clear, nodes, place, share)
+                share_row(patches, y + top, left, clear[:width], nodes, place, share[:width])
             transmittance_row(
-                ray_x, ray_y, slant, share, optics, medium, resolved_depth, tau, clear
+                ray_x,
+                ray_y,
+                slant,
+                share,
+                optics,
+                medium,
+                resolved_depth,
+                place,
+                carried,
+                tau,
+                clear,
             )
-            light_row(surface, y + top, left, linear, red, green, blue)
+            light_row(surface, y + top, left, linear, red[:width], green[:width], blue[:width])
             if overcast:
                 if ring.shape[0] > 0:
-                    _overcast_row(
-                        ring[y], ray_x, ray_y, optics, matrix, tone, airlight, red, green, blue
-                    )
+                    for x in range(width):
+                        shown[x] = np.uint8(ring[y, x])
                 else:
-                    _overcast_row(
-                        sky[k], ray_x, ray_y, optics, matrix, tone, airlight, red, green, blue
-                    )
+                    shown = sky[k]
+                _overcast_row(shown, ray_x, ray_y, optics, matrix, tone, airlight, red, green, blue)
             _fog_row(clear, airlight, red, green, blue, gap[k])
         mine = splats[band_starts[band] : band_starts[band + 1]]
         blend_band(mine, window, y0, planes, tiles)
@@ -134,9 +144,9 @@ def shade(
             k = y - y0
             for channel in range(3):
                 if tone.encoded > np.float32(0.0):
-                    _level_row(planes[k, channel, :width], out[channel, y])
+                    _level_row(planes[k, channel, :wide], out[channel, y])
                 else:
-                    encode_row(planes[k, channel, :width], out[channel, y])
+                    encode_row(planes[k, channel, :wide], out[channel, y])
             _copy_row(planes[k, 3, :width], through[y])
             _distinct_row(gap[k], through[y], sky[k], least_contrast, distinct[y])
             hidden += _count_below(through[y], sky[k], hazy)
@@ -218,13 +228,13 @@ def _level_row(light, out):
 @compiled
 def _copy_row(row, out):
     """Copy in a loop: an assignment of slices takes its time to compare shapes and overlaps."""
-    for x in range(row.shape[0]):
+    for x in range(out.shape[0]):
         out[x] = row[x]
 
 
 @compiled
 def _distinct_row(gap, through, sky, least_contrast, out):
-    for x in range(gap.shape[0]):
+    for x in range(out.shape[0]):
         seen = (gap[x] * through[x] >= least_contrast) & (sky[x] == np.uint8(0))
         out[x] = np.uint8(1) if seen else np.uint8(0)
 

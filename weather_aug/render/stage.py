@@ -176,7 +176,7 @@ class Stage:
         sky_luminance = max(float(self.ambience.sky @ LUMINANCE), 0.05)
         sky = (look.overcast, sky_luminance, ZENITH_GAIN, look.encoded)
         limits = (least_linear_contrast(self.ambience.airlight), HAZY_TRANSMITTANCE)
-        levels = np.empty((3, height, width), np.uint8)
+        levels = np.empty((3, height, (width + 15) // 16 * 16), np.uint8)
         through = np.empty((height, width), np.float32)
         distinct = np.empty((height, width), np.uint8)
         covered = np.zeros((height, width), np.uint8)
@@ -200,7 +200,7 @@ class Stage:
             distinct,
             covered,
         )
-        merged: UInt8 = cv2.merge(tuple(levels))
+        merged: UInt8 = cv2.merge(tuple(levels[:, :, :width]))
         return Planes(merged, through, distinct, covered, hazy_count)
 
 

@@ -11,6 +11,7 @@ from scipy.integrate import quad
 from physics_figures import scenes
 from physics_figures.style import BLUE, GREEN, ORANGE, PURPLE, formula, measured, panels
 from weather_aug.colour import linear_from_srgb
+from weather_aug.particles import statistics
 from weather_aug.render.compose import render
 from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
@@ -157,7 +158,14 @@ def extinction(quick: bool) -> tuple[Figure, dict[str, float]]:
         f"snow, size law over 2.45 S, {name}, {v:g} mm/h": _size_law_per_km(v, end) / (2.45 * v)
         for name, end in (("cut at 6 mm", 6.0), ("whole", np.inf))
         for v in rates_s
-    }
+    } | {f"snow, share of the extinction in classes, {v:g} mm/h": _in_classes(v) for v in rates_s}
+
+
+def _in_classes(rate: float) -> float:
+    """Share of a dry snowfall's extinction that could be drawn, and not only be veil."""
+    flakes = statistics.snow(rate)
+    area_m2 = (np.pi / 4 * flakes.diameters_m**2).mean(axis=1)
+    return float(flakes.density_per_m3 @ area_m2 / flakes.extinction_per_m)
 
 
 def _size_law_per_km(rate: float, end_mm: float = 6.0) -> float:

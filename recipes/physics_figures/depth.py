@@ -9,6 +9,7 @@ from scipy.integrate import quad
 from physics_figures import scenes
 from physics_figures.style import BLACK, BLUE, GREEN, LIGHT, ORANGE, formula, measured, panels
 from weather_aug.particles import statistics
+from weather_aug.particles.resolve import drawn_share
 from weather_aug.render.froxels import even_fog
 from weather_aug.render.medium import optical_depth
 from weather_aug.render.options import RenderOptions
@@ -50,11 +51,30 @@ def explicit_and_residual(quick: bool) -> tuple[Figure, dict[str, float]]:
         found[f"{name}: chi-squared per depth"] = float(((off / 100 * whole / error) ** 2).mean())
         found[f"{name}: share drawn at 5.5 m, %"] = float(100 * (drawn / whole)[6])
         found[f"{name}: share drawn at 60 m, %"] = float(100 * (drawn / whole)[-1])
+    found |= _arrivals()
     axes[0, 0].set(ylabel="share of the whole")
     axes[1, 0].set(ylabel="sum off, %")
     legend = axes[0, 0].legend(loc="center", bbox_to_anchor=(0.55, 0.62), frameon=True)
     legend.get_frame().set(alpha=1, linewidth=0)
     return figure, found
+
+
+def _arrivals() -> dict[str, float]:
+    """What the latest particles of cubes lack, by drawing cubes, against the closed form."""
+    rng = np.random.default_rng(1)
+    found, worst = {}, 0.0
+    for mean in (0.01, 0.1, 1.0, 10.0, 40.0):
+        count = rng.poisson(mean, round(max(1.0, 1 / mean) * 400_000))
+        # All particles of a cube share one fraction, as they share one uniform number.
+        fraction, width = rng.random(len(count)), 0.25 + 0.1 * mean
+        opaque = 0.0
+        for later in range(count.max()):
+            some = count > later
+            opaque += np.minimum(1.0, (later + fraction[some]) / width).sum()
+        share = float(drawn_share(np.array([mean]))[0])
+        worst = max(worst, abs(opaque / count.sum() / share - 1))
+        found[f"arrivals: share of the opacity that is there, mean count {mean:g}, %"] = 100 * share
+    return found | {"arrivals: largest deviation of drawn cubes from it, %": 100 * worst}
 
 
 def _drawn(
@@ -188,7 +208,6 @@ def _rendered_snow(seeds: int) -> tuple[scenes.Float, scenes.Float]:
 
 
 def _snow_per_m(rate: float) -> float:
-    """Quadrature of the flakes' silhouettes, pi/4 D^2 with D^2 = Dm^3 / 0.17."""
-    slope, intercept = 2.55 * rate**-0.48, 3800 * rate**-0.87
-    area = quad(lambda d: intercept * np.exp(-slope * d) * d**3 / 0.17, 0, np.inf)[0]
-    return float(np.pi / 4 * 1e-6 * area)
+    """Rasmussen's extinction: 1.5 times the mass of the water in a m3 of air, over 0.17."""
+    water_g_per_m3 = rate * 1e3 / 3600 / 1.0
+    return 1.5e-3 * water_g_per_m3 / 0.17

@@ -69,6 +69,6 @@ def _per_m(weather: Weather) -> float:
         rain = 0.1824e-3 * weather.rain_mm_per_h**0.63 * cut
     snow = 0.0
     if weather.snow_mm_per_h > 0:
-        slope, intercept = 2.55 * weather.snow_mm_per_h**-0.48, 3800 * weather.snow_mm_per_h**-0.87
-        snow = np.pi / 4 * 1e-6 * 6 * intercept / slope**4 / 0.17
+        # Water that falls in an hour, in grams, over what falls past: 3600 m at 1 m/s.
+        snow = 1.5e-3 * (weather.snow_mm_per_h * 1e3 / 3600) / 0.17
     return float(rain + snow + weather.mist_per_km * 1e-3 + np.log(20) / weather.visibility_m)

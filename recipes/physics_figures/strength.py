@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.integrate import quad
 
 from physics_figures import scenes
 from physics_figures.style import BLUE, GREEN, ORANGE, PURPLE, formula, measured, panels
 from weather_aug.colour import linear_from_srgb
+from weather_aug.particles import statistics
 from weather_aug.render.compose import render
 from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
@@ -124,8 +126,10 @@ def extinction(quick: bool) -> tuple[Figure, dict[str, float]]:
     left.legend(loc="upper left", fontsize=8.6)
     rates_s = np.array([0.4, 1.0, 2.0, 4.0, 10.0])
     s = np.geomspace(0.3, 12, 40)
-    formula(right, s, 2.46 * s, "Rasmussen, dry: 2.46 S")
+    formula(right, s, 2.45 * s, "Rasmussen, dry: 2.45 S")
     formula(right, s, 0.29 * s, "Rasmussen, wet: 0.29 S", ls="--")
+    law = np.array([_size_law_per_km(v) for v in s])
+    right.plot(s, law, color=GREEN, lw=1.1, ls=":", label="size law, cut at 6 mm")
     dry, wet = (
         np.array([_rendered_extinction(cam, "snow_mm_per_h", v, quick, wetness) for v in rates_s])
         for wetness in (0.0, 1.0)
@@ -146,11 +150,29 @@ def extinction(quick: bool) -> tuple[Figure, dict[str, float]]:
             2e3 * rain[3] / (0.334 * 10**0.64)
         ),
         "rain, doubled, over Carbonneau: largest": float(between[1].max()),
-        "snow, dry: smallest over 2.46 S": float((1e3 * dry / (2.46 * rates_s)).min()),
-        "snow, dry: largest over 2.46 S": float((1e3 * dry / (2.46 * rates_s)).max()),
+        "snow, dry: smallest over 2.45 S": float((1e3 * dry / (2.45 * rates_s)).min()),
+        "snow, dry: largest over 2.45 S": float((1e3 * dry / (2.45 * rates_s)).max()),
         "snow, wet: smallest over 0.29 S": float((1e3 * wet / (0.29 * rates_s)).min()),
         "snow, wet: largest over 0.29 S": float((1e3 * wet / (0.29 * rates_s)).max()),
-    }
+    } | {
+        f"snow, size law over 2.45 S, {name}, {v:g} mm/h": _size_law_per_km(v, end) / (2.45 * v)
+        for name, end in (("cut at 6 mm", 6.0), ("whole", np.inf))
+        for v in rates_s
+    } | {f"snow, share of the extinction in classes, {v:g} mm/h": _in_classes(v) for v in rates_s}
+
+
+def _in_classes(rate: float) -> float:
+    """Share of a dry snowfall's extinction that could be drawn, and not only be veil."""
+    flakes = statistics.snow(rate)
+    area_m2 = (np.pi / 4 * flakes.diameters_m**2).mean(axis=1)
+    return float(flakes.density_per_m3 @ area_m2 / flakes.extinction_per_m)
+
+
+def _size_law_per_km(rate: float, end_mm: float = 6.0) -> float:
+    """Silhouettes of dry flakes after Gunn and Marshall, pi/4 D^2 with D^2 = Dm^3 / 0.17."""
+    slope, intercept = 2.55 * rate**-0.48, 3800 * rate**-0.87
+    area = quad(lambda d: intercept * np.exp(-slope * d) * d**3 / 0.17, 0, end_mm)[0]
+    return float(np.pi / 4 * 1e-3 * area)
 
 
 def _rendered_extinction(

@@ -7,7 +7,8 @@ Convention:
     No particle jumps while the weather changes, because
 
     1. a particle's place depends on the time (its fall in still air when dry), on `Air.drift_m` and
-       on `Air.wet_s` (how much faster it fell when wet), on the seed, and on nothing else. Both are
+       on `Air.wet_s` (how much faster it fell when wet), on the seed, and, by centimetres around
+       that place, on how strongly the wind of the moment lets drops sway. The first two are
        integrals since time 0, so they are continuous, and their slopes are the wind and wetness of
        the moment: streaks point where particles go. Wind now times time is no drift: when the wind
        changes by 1 m/s at 100 s, all the air would leap 100 m;

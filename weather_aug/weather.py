@@ -41,7 +41,7 @@ class Weather:
 
     Source:
         Rates inside the classes of the American Meteorological Society and the Met Office;
-        fog stops at the three levels of Foggy Cityscapes; see docs/design.md.
+        fog stops at the three levels of Foggy Cityscapes; see docs/physics.md.
     """
 
     rain_mm_per_h: float = 0.0
@@ -392,7 +392,12 @@ def parse_severity(severity: float | str) -> float:
 def _severity(severity: float | str | None, unit: str, value: float | None, inverse: Any) -> float:
     if (severity is None) == (value is None):
         raise ArgumentError(f"give either a severity or {unit}")
-    return float(inverse(value)) if severity is None else parse_severity(severity)
+    if severity is None:
+        return float(inverse(value))
+    try:
+        return parse_severity(severity)
+    except ArgumentError as error:
+        raise ArgumentError(f"{error}; for a value in its unit write {unit}=...") from None
 
 
 def _fog_inverse_height(s: float) -> float:

@@ -1,8 +1,8 @@
 """The sanity checks of the physics: where each one is, and which faults turn it red.
 
 Each check is a function `check_*` that a test runs once on the package (it passes) and once on each
-planted fault (it fails; tests named `..._found_out`). The numbers are those of section 9 of the
-physics notes, with their tolerances; 14 belongs to the wet road and 15 to the labels' own tests.
+planted fault (it fails; tests named `..._found_out`). The numbers are those of the
+table of promises in docs/physics.md; 14 is kept for the wet road, 15 is in the labels' own tests.
 
 no  what                         check (file test_sanity_..., function)       planted faults
 1   Beer and Lambert, scatter    extinction.check_beer_lambert                paper's opacities

@@ -288,3 +288,28 @@ def test_warm_up_leaves_nothing_to_compile():
             render(candidate, weather, seed=0, ambience=AMBIENCE)
             render(candidate, weather, seed=0, ambience=AMBIENCE, window=(5, 7, 20, 30))
     assert before == [len(kernel.signatures) for kernel in kernels]
+
+
+def test_the_sky_of_an_unlabelled_frame_is_not_invalid():
+    """However thick the air: the sky is what the airlight looks like."""
+    frame = street_frame()
+    unlabelled = replace(frame, label=None)
+    sky = np.isinf(np.asarray(frame.depth_m))
+    assert 0 < sky.sum() < sky.size
+    shot = render(unlabelled, Weather.fog("extreme"), seed=0, ambience=AMBIENCE)
+    assert not shot.invalid[sky].any()
+    assert shot.invalid[~sky].any()
+
+
+@pytest.mark.parametrize(
+    "given", [{"alignment": "camera"}, {"rain_fall_speed": "atlas"}, {"multiple_scattering": True}]
+)
+def test_options_that_a_preset_would_ignore_are_refused(given):
+    with pytest.raises(ArgumentError, match="means nothing with preset"):
+        RenderOptions(preset="weatheredit", **given)
+    assert RenderOptions(**given) != RenderOptions()
+
+
+def test_options_of_another_type_are_refused():
+    with pytest.raises(ArgumentError, match="options must be RenderOptions, got dict"):
+        render(street_frame(), Weather.fog(0.5), seed=0, ambience=AMBIENCE, options={})

@@ -22,6 +22,7 @@ from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.render.scattering import scattering_margin_px
 from weather_aug.render.stage import Planes, Stage
 from weather_aug.render.surface import depth_of, surface_of
+from weather_aug.taxonomy import SKY
 from weather_aug.weather import Weather
 
 Float32 = NDArray[np.float32]
@@ -39,7 +40,7 @@ class RenderedFrame:
     label_full: UInt8 | None
     """(H, W) train ids of the clear frame."""
     invalid: UInt8
-    """(H, W), 1 where the surface is undetectable or beyond the optical range."""
+    """(H, W), 1 where the surface is undetectable or beyond the optical range; the sky is none."""
     transmittance: Float32
     """(H, W) share of the surface's light that reaches the pixel, in [0, 1]."""
     frame: Frame
@@ -97,6 +98,8 @@ def render(
         raise ArgumentError(
             f"frame {frame.key} has no depth; build a scene from the clip, or pass depth_m"
         )
+    if not isinstance(options, RenderOptions):
+        raise ArgumentError(f"options must be RenderOptions, got {type(options).__name__}")
     height, width = frame.image.shape[:2]
     window = checked_window(window, height, width)
     if weather.is_clear:
@@ -194,6 +197,15 @@ def _margin_px(frame: Frame, options: RenderOptions) -> int:
     return margin
 
 
+def _seen(frame: Frame, window: Window) -> UInt8:
+    """Train ids of a window; where nobody labelled, the sky is what is endlessly far."""
+    if frame.label is None:
+        far = np.isinf(depth_of(surface_of(frame), window))
+        return np.where(far, np.uint8(SKY), np.uint8(0))
+    # A copy, because the kernel would be compiled once more for what may not be written.
+    return np.array(frame.label[_part(window)], order="C")
+
+
 def _trimmed(shot: Planes, frame: Frame, outer: Window, window: Window) -> RenderedFrame:
     """Labels from the outer window, then everything cut to the inner one."""
     part = _part((window[0] - outer[0], window[1] - outer[1], *window[2:]))
@@ -202,11 +214,8 @@ def _trimmed(shot: Planes, frame: Frame, outer: Window, window: Window) -> Rende
     honest = None if full is None else full.copy()
     invalid = np.zeros(window[2:], np.uint8)
     if shot.hazy_count or shot.covered.any():
-        seen = np.zeros_like(shot.covered) if frame.label is None else frame.label[_part(outer)]
-        # A copy, because the kernel would be compiled once more for what may not be written.
-        planes = readable_labels(
-            np.array(seen, order="C"), shot.transmittance, shot.distinct, shot.covered
-        )
+        seen = _seen(frame, outer)
+        planes = readable_labels(seen, shot.transmittance, shot.distinct, shot.covered)
         invalid = cut(planes[1][part])
         honest = None if full is None else cut(planes[0][part])
     return RenderedFrame(

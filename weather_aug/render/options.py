@@ -24,7 +24,8 @@ class RenderOptions:
     """
 
     max_particles: int = 20_000
-    """Expected number of resolved particles in a whole picture; the rest becomes extinction."""
+    """Expected number of resolved particles in a whole picture; the rest becomes extinction.
+    WeatherEdit's presets have counts of their own."""
     alignment: Alignment = "world"
     """"camera" carries the particles along with the clip's first camera, as the paper's equations
     do: they then fall as if the car were parked, while their streaks still tell of its motion."""
@@ -49,11 +50,23 @@ class RenderOptions:
             if value not in allowed:
                 known = ", ".join(repr(choice) for choice in allowed)
                 raise ArgumentError(f"{name} must be one of {known}, got {printable(value)!r}")
-        if self.ablation != "none" and self.preset == "physical":
-            raise ArgumentError(
-                f"ablation={self.ablation!r} leaves out a part of WeatherEdit's release; give "
-                "preset='weatheredit' too"
-            )
+        object.__setattr__(self, "multiple_scattering", bool(self.multiple_scattering))
+        if self.preset == "physical":
+            if self.ablation != "none":
+                raise ArgumentError(
+                    f"ablation={self.ablation!r} leaves out a part of WeatherEdit's release; give "
+                    "preset='weatheredit' too"
+                )
+        else:
+            self._check_nothing_ignored()
+
+    def _check_nothing_ignored(self) -> None:
+        for name in ("alignment", "rain_fall_speed", "multiple_scattering"):
+            if getattr(self, name) != RenderOptions.__dataclass_fields__[name].default:
+                raise ArgumentError(
+                    f"{name}={getattr(self, name)!r} means nothing with preset={self.preset!r}; "
+                    "leave it out (the release is aligned with the camera; see ablation)"
+                )
 
     @property
     def needs_rig(self) -> bool:

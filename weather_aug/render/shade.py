@@ -109,7 +109,7 @@ def shade(
             red, green, blue = planes[k, 0, :wide], planes[k, 1, :wide], planes[k, 2, :wide]
             clear, depth = planes[k, 3, :wide], planes[k, 4, :wide]
             depth_row(surface, y + top, left, bits[k, 4, :width], depth[:width])
-            sky_row(surface, y + top, left, sky[k, :width])
+            sky_row(surface, y + top, left, depth[:width], sky[k, :width])
             reach_row(depth, ray_x, ray_y, optics, slant, clear)
             if patchy:
                 share_row(patches, y + top, left, clear[:width], nodes, place, share[:width])

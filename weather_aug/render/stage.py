@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from weather_aug.air import Air
 from weather_aug.clip.types import Camera
-from weather_aug.colour import LUMINANCE
+from weather_aug.colour import LUMINANCE, SRGB_LEVELS_LINEAR
 from weather_aug.edit.physical.overcast import ZENITH_GAIN, tone
 from weather_aug.particles.field import ParticleField, Window
 from weather_aug.particles.resolve import DEPTH_BINS, FAR_M
@@ -109,25 +109,20 @@ class Stage:
             self.window,
             shelter,
         )
-        scattered = self.options.multiple_scattering
-        surface = self._scattered(air) if scattered else self.surface
-        look = _Look(*tone(weather.overcast), weather.overcast, 0.0)
-        return self._run(surface, air, look, splats)
+        if self.options.multiple_scattering:
+            plain = _Look(SRGB_LEVELS_LINEAR, np.eye(3), 0.0, 0.0)
+            return self._run(self._scattered(air), air, plain, splats)
+        return self._run(self.surface, air, self._look, splats)
 
     def published(self, rig: RigMotion, time_s: float) -> Planes:
         """The window with the weather's sky and the particles of WeatherEdit's release.
 
         First the background, then the particles over it, blended as they are stored: in sRGB.
         """
-        weather = self.weather
-        clear = medium_of(Weather(), (), self.ambience)
-        air = _Air(clear, np.zeros(DEPTH_BINS + 1, np.float32), even_fog())
-        look = _Look(*tone(weather.overcast), weather.overcast, 0.0)
-        background = self._run(self.surface, air, look, np.empty((0, 16), np.float32))
         splats = published_splats(
             self.camera,
             time_s,
-            weather,
+            self.weather,
             self.seed,
             self.ambience.axes_world,
             self.options,
@@ -135,8 +130,8 @@ class Stage:
             self._optics,
             self.window,
         )
-        painted = repainted(self.surface, background.image, self.window)
-        return self._run(painted, air, _Look(np.arange(256) / 255, np.eye(3), 0.0, 1.0), splats)
+        encoded = _Look(np.arange(256) / 255, np.eye(3), 0.0, 1.0)
+        return self._run(self._background(), self._clear_air, encoded, splats)
 
     @property
     def _optics(self) -> Optics:
@@ -159,15 +154,29 @@ class Stage:
         )
         return even_fog() if volume is None else volume
 
+    @property
+    def _look(self) -> _Look:
+        """How recorded colours change under the weather's sky."""
+        return _Look(*tone(self.weather.overcast), self.weather.overcast, 0.0)
+
+    @property
+    def _clear_air(self) -> _Air:
+        medium = medium_of(Weather(), (), self.ambience)
+        return _Air(medium, np.zeros(DEPTH_BINS + 1, np.float32), even_fog())
+
+    def _background(self) -> Surface:
+        """The surface under the weather's sky, without anything in the air."""
+        shot = self._run(self.surface, self._clear_air, self._look, np.empty((0, 16), np.float32))
+        return repainted(self.surface, shot.image, self.window)
+
     def _scattered(self, air: _Air) -> Surface:
-        """The surface with what lies behind thick air blurred."""
-        top, left, height, width = self.window
-        whole = self.surface.image.reshape(-1, self.surface.width, 3)
-        image = np.ascontiguousarray(whole[top : top + height, left : left + width])
+        """The background with what lies behind thick air blurred."""
         depth = depth_of(self.surface, self.window)
         tau = optical_depth(depth, self.window, self._optics, *air)
-        image = scattered_background(image, tau, max(self.camera.focal_px))
-        return repainted(self.surface, image, self.window)
+        shape = (*self.window[2:], 3)
+        image = self._background().image.reshape(shape)
+        blurred = scattered_background(image, tau, max(self.camera.focal_px))
+        return repainted(self.surface, blurred, self.window)
 
     def _run(self, surface: Surface, air: _Air, look: _Look, splats: Float32) -> Planes:
         """Allocate what the kernel writes, and run it."""

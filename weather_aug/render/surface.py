@@ -129,12 +129,15 @@ def depth_row(surface, y, left, bits, out):
 
 
 @compiled
-def sky_row(surface, y, left, out):
-    """Where picture row y from column `left` is labelled sky; (W,) uint8, 0 without labels."""
+def sky_row(surface, y, left, depth, out):
+    """Where picture row y from column `left` is sky; (W,) uint8.
+
+    By its label, and where nobody labelled by its endless `depth` (W,).
+    """
     width = out.shape[0]
     if surface.label.shape[0] == 0:
         for x in range(width):
-            out[x] = 0
+            out[x] = np.uint8(depth[x] == np.float32(np.inf))
         return
     start = y * surface.width + left
     label = surface.label[start : start + width]

@@ -151,6 +151,8 @@ class WeatherScene:
                 tells.
             options: Choices besides the weather.
         """
+        if not isinstance(options, RenderOptions):
+            raise ArgumentError(f"options must be RenderOptions, got {type(options).__name__}")
         frame = self.frame(key)
         frame = replace(frame, time_s=frame.time_s - self.manifest.frames[0].time_s)
         if isinstance(weather, WeatherTimeline):
@@ -186,7 +188,13 @@ class WeatherScene:
         return camera.height, camera.width
 
     def _record(self, key: FrameKey) -> store.FrameRecord:
-        record = self.manifest.by_key.get(FrameKey(*key))
+        try:
+            record = self.manifest.by_key.get(FrameKey(*key))
+        except TypeError:
+            raise ArgumentError(
+                f"a frame is named by FrameKey(time_index, camera), got {printable(key)!r}; "
+                "scene.keys lists them"
+            ) from None
         if record is None:
             raise ArgumentError(
                 f"scene {self.name} has no frame {printable(key)}; it has {len(self.keys)} frames "

@@ -60,6 +60,8 @@ class WeatherDataset(Dataset[Any]):
         crop: tuple[int, int] | None = None,
         options: RenderOptions = DEFAULT_OPTIONS,
     ) -> None:
+        if isinstance(scenes, WeatherScene):
+            raise ArgumentError("scenes must be a sequence; write WeatherDataset([scene], ...)")
         self.scenes = tuple(scenes)
         if not self.scenes or not all(isinstance(scene, WeatherScene) for scene in self.scenes):
             raise ArgumentError("scenes must be one or more of WeatherScene.load(folder)")

@@ -69,11 +69,11 @@ def streaks_m(population, camera):
 
 
 def reach_m(diameter_m, streak_m, focal_px, alpha):
-    """Depth where (pi/4) w^2 / (max(w, 1) max(l + w, 1)) falls to alpha, by search."""
+    """Depth where (pi/4) w^2 / (max(w, 1) max(l + w, 1)) falls to alpha (1 + z / 30), by search."""
     depth = np.geomspace(0.01, 400, 40_000)
     w, length = focal_px * diameter_m / depth, focal_px * streak_m / depth
     pixel = np.pi / 4 * w * w / (np.maximum(w, 1) * np.maximum(length + w, 1))
-    above = depth[pixel >= alpha]
+    above = depth[pixel >= alpha * (1 + depth / 30)]
     return above[-1] if len(above) else 0.0
 
 

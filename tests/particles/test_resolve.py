@@ -26,13 +26,16 @@ def test_a_small_budget_is_used_in_dense_snow(rate, budget):
 
 @pytest.mark.parametrize(("rate", "reference"), [(2.5, 17_000), (10.0, 68_000), (50.0, 308_000)])
 def test_drops_that_a_driving_camera_resolves(rate, reference):
-    """KITTI's camera at 10 m/s, counted before by integrating over the mean image streak."""
+    """KITTI's camera at 10 m/s, counted before by integrating over the mean image streak.
+
+    With an even threshold; ours asks more of what is far.
+    """
     cam = camera(speed=10.0, width=1242, height=375, exposure_s=0.002)
     focal = np.diag([721.0, 721.0, 1.0]) + np.array([[0, 0, 621], [0, 0, 187], [0, 0, 0.0]])
     cam = replace(cam, intrinsics=focal)
     resolved = field(statistics.rain(rate)).resolve(cam, 500_000)
     assert resolved.alpha_min == 0.01
-    assert 0.5 * reference < resolved.expected_count < 1.6 * reference
+    assert 0.3 * reference < resolved.expected_count < 1.1 * reference
 
 
 def test_motion_along_the_view_hides_no_drops():

@@ -27,11 +27,10 @@ from weather_aug.errors import ArgumentError
 from weather_aug.particles import kernels
 from weather_aug.particles.resolve import (
     FADE_SHARE,
-    NEAR_FULL_M,
-    NEAR_M,
     Resolved,
     arrivals,
     resolve,
+    shutter_turning_rad_per_s,
 )
 from weather_aug.particles.statistics import Population
 from weather_aug.particles.tumble import shape_turns, shapes_in
@@ -41,6 +40,8 @@ RECORD = 13
 """Numbers of a particle: position, velocity, covariance (xx, xy, xz, yy, yz, zz), opacity."""
 BLUR_PX = 6.0
 """Reach of the pixel filter around a particle."""
+BEYOND_PICTURE = 1.0
+"""Particles are drawn up to this far outside the picture, as a tangent, where streaks reach in."""
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -114,23 +115,28 @@ class ParticleField:
         sway_m_per_s = sway_m * population.sway_rad_per_s
         reach_m = np.array(resolved.reach_m)
         speed = np.linalg.norm(relative, axis=1) + sway_m_per_s.sum(axis=1)
-        tangents, pad_m = _padded_view(camera, window, reach_m, speed, population)
-        fade_per_m = (1.0 / (FADE_SHARE * np.maximum(reach_m, NEAR_M))).astype(np.float32)
+        tangents, steepest = _tangents(camera, window), _steepest(camera)
+        pad_m = _pad_m(camera, steepest, reach_m, speed, population)
+        near_m = resolved.near_m
+        fade_per_m = (1.0 / (FADE_SHARE * np.maximum(reach_m, near_m))).astype(np.float32)
         inputs = (
             _class_keys(population.kind, self.seed, len(pad_m)),
             _counts(tuple(population.mean_per_cell)),
             arrivals(population.mean_per_cell),
             population.cell_m,
             field_from_camera[:3, 3] - self._carried_m(time_s),
-            *_planes_and_bounds(turned, tangents, reach_m, pad_m, sway_m, population.cell_m),
+            *_planes_and_bounds(
+                turned, tangents, near_m, reach_m, pad_m, sway_m, population.cell_m
+            ),
             kernels.View(
-                NEAR_M,
-                NEAR_FULL_M,
+                near_m,
+                resolved.near_full_m,
                 reach_m,
                 fade_per_m,
                 np.ascontiguousarray(turned.T),
                 tangents,
                 pad_m,
+                steepest,
             ),
             kernels.Motion(
                 (relative @ rotation).astype(np.float32),
@@ -209,18 +215,11 @@ def _counts(mean_per_cell: tuple[float, ...]) -> NDArray[np.uint64]:
     return counts
 
 
-def _padded_view(
-    camera: Camera, window: Window, reach_m: Float32, speed: Float64, population: Population
-) -> tuple[Float64, Float64]:
-    """Tangents (x0, x1, y0, y1) of the window's view, and metres (C,) to pad it by.
-
-    A particle touches the window with its streak, so the view is padded by the streak's length (in
-    metres, seen at the steepest angle of the picture) and by the blur (in pixels).
-    """
-    fx, fy = camera.focal_px
-    cx, cy = camera.principal_px
+def _tangents(camera: Camera, window: Window) -> Float64:
+    """Tangents (x0, x1, y0, y1) of a window's view, with the reach of the pixel filter."""
+    (fx, fy), (cx, cy) = camera.focal_px, camera.principal_px
     top, left, height, width = window
-    view = np.array(
+    return np.array(
         [
             (left - BLUR_PX - cx) / fx,
             (left + width + BLUR_PX - cx) / fx,
@@ -228,22 +227,35 @@ def _padded_view(
             (top + height + BLUR_PX - cy) / fy,
         ]
     )
+
+
+def _steepest(camera: Camera) -> Float64:
+    """Tangents (2,) across and down of the steepest particles that are drawn.
+
+    Of the whole picture and not of a window, lest a window draws other particles than the whole.
+    """
+    whole = np.abs(_tangents(camera, (0, 0, camera.height, camera.width)))
+    return whole.reshape(2, 2).max(axis=1) + BEYOND_PICTURE
+
+
+def _pad_m(
+    camera: Camera, steepest: Float64, reach_m: Float32, speed: Float64, population: Population
+) -> Float64:
+    """Metres (C,) from which outside a view a particle still touches it.
+
+    By its streak's length, seen at the steepest angle at which particles are drawn.
+    """
     still_m = 2 * camera.aperture_m + 2 * population.diameters_m.max(axis=1)
-    # A padded particle is seen at a steeper angle than the view's own, which lengthens its streak:
-    # once round settles it.
-    widest = np.abs(view).max()
-    for _ in range(2):
-        steepness = np.hypot(1.0, np.sqrt(2) * widest)
-        turning = np.linalg.norm(camera.angular_velocity_rad_per_s) * reach_m.max(axis=1)
-        streak_m = (speed + turning * steepness) * camera.exposure_s * (1.0 + widest)
-        pad_m = streak_m + still_m
-        widest = np.minimum(np.abs(view).max() + pad_m / NEAR_M, np.abs(view).max() + 1.0)
-    return view, np.asarray(pad_m)
+    turning = np.linalg.norm(shutter_turning_rad_per_s(camera)) * reach_m.max(axis=1)
+    swept = speed + turning * np.hypot(1.0, np.linalg.norm(steepest))
+    pad_m: Float64 = swept * camera.exposure_s * (1.0 + steepest.max()) + still_m
+    return pad_m
 
 
 def _planes_and_bounds(
     rotation: Float64,
     view: Float64,
+    near_m: float,
     reach_m: Float32,
     pad_m: Float64,
     sway_m: Float64,
@@ -264,12 +276,12 @@ def _planes_and_bounds(
     planes = np.empty((len(far_m), 6, 4))
     planes[:, :, :3] = normals
     planes[:, :4, 3] = pad_m[:, None]
-    planes[:, 4, 3], planes[:, 5, 3] = -NEAR_M, far_m
+    planes[:, 4, 3], planes[:, 5, 3] = -near_m, far_m
     swing_m = np.linalg.norm(sway_m, axis=1, keepdims=True)
     planes[:, :, 3] += swing_m + 0.5 * cell_m[:, None] * np.abs(normals).sum(axis=1)
     rays = np.array([(x, y, 1.0) for x in (x0, x1) for y in (y0, y1)]) @ rotation.T
     corners = np.concatenate(
-        [far_m[:, None, None] * rays, np.broadcast_to(NEAR_M * rays, (len(far_m), 4, 3))], axis=1
+        [far_m[:, None, None] * rays, np.broadcast_to(near_m * rays, (len(far_m), 4, 3))], axis=1
     )
     # Across the picture the pads of both sides add up in the corners.
     pad = np.sqrt(2) * pad_m[:, None] + swing_m

@@ -36,6 +36,8 @@ class View(NamedTuple):
     """(4,): left, right, top, bottom of the view, blur included."""
     pad_m: Any
     """(C,) how far outside the view a particle of the class still touches it."""
+    steepest: Any
+    """(2,) tangents across and down beyond which no particle of the whole picture is drawn."""
 
 
 class Motion(NamedTuple):
@@ -68,25 +70,47 @@ class Looks(NamedTuple):
 
 
 @compiled
-def reach(diameter_m, streak_m, focal_px, alpha):
-    """Depth at which a particle's pixel opacity falls to `alpha`; 0 if it is fainter everywhere."""
+def reach(diameter_m, streak_m, focal_px, alpha, half_m):
+    """Depth up to which a particle's pixel opacity is at least alpha (1 + z / half_m), or 0.
+
+    The opacity stays the same while the particle is wider than a pixel, then falls with the depth
+    while its streak is longer than a pixel, then with its square.
+    """
+    quarter_pi = QUARTER_PI
     length_m = streak_m + diameter_m
-    if QUARTER_PI * diameter_m < alpha * length_m:
-        return 0.0
-    as_streak = QUARTER_PI * focal_px * diameter_m * diameter_m / (alpha * length_m)
-    if as_streak <= focal_px * length_m:
-        return as_streak
-    return focal_px * diameter_m * np.sqrt(QUARTER_PI / alpha)
+    flat = half_m * (quarter_pi * diameter_m / (alpha * length_m) - 1.0)
+    if flat <= focal_px * diameter_m:
+        return max(flat, 0.0)
+    streak = quarter_pi * focal_px * diameter_m * diameter_m / (alpha * length_m)
+    falling = 0.5 * half_m * (np.sqrt(1.0 + 4.0 * streak / half_m) - 1.0)
+    if falling <= focal_px * length_m:
+        return falling
+    square = quarter_pi * (focal_px * diameter_m) ** 2 / alpha
+    z = np.sqrt(square)
+    for _ in range(6):
+        # Newton's steps come down from above: the function is convex.
+        z -= (z * z * (1.0 + z / half_m) - square) / (z * (2.0 + 3.0 * z / half_m))
+    return z
 
 
 @compiled
 def _fill_reach(
-    diameters_m, per_size, streak_m, focal_px, solid_px, alpha, near_m, least_m, far_m, reach_m
+    diameters_m,
+    per_size,
+    streak_m,
+    focal_px,
+    solid_px,
+    half_m,
+    alpha,
+    near_m,
+    least_m,
+    far_m,
+    reach_m,
 ):
     count = 0.0
     for c in range(diameters_m.shape[0]):
         for q in range(diameters_m.shape[1]):
-            z = min(reach(diameters_m[c, q], streak_m[c], focal_px, alpha), far_m)
+            z = min(reach(diameters_m[c, q], streak_m[c], focal_px, alpha, half_m), far_m)
             if z <= least_m:
                 z = 0.0
             else:
@@ -97,19 +121,30 @@ def _fill_reach(
 
 @compiled
 def solve_reach(
-    diameters_m, per_size, streak_m, focal_px, solid_px, budget, faintest, near_m, least_m, far_m
+    diameters_m,
+    per_size,
+    streak_m,
+    focal_px,
+    solid_px,
+    half_m,
+    budget,
+    faintest,
+    near_m,
+    least_m,
+    far_m,
 ):
     """Smallest opacity threshold whose expected particle count keeps the budget, by bisection.
 
-    A particle wider than a pixel is as opaque near as far, so that a threshold may let in all of a
-    dense size or none: then the depth is bounded too, so that the budget is used. A size whose
-    reach would be under `least_m` is not drawn at all.
+    The threshold rises with the depth, doubling at `half_m`: a particle wider than a pixel is as
+    opaque near as far, so that an even threshold would let in all of a dense size or none, and the
+    reach would leap when weather or speed change. A size whose reach would be under `least_m` is
+    not drawn at all.
 
     Returns:
         The threshold, reach (C, Q) in metres, and the expected count.
     """
     reach_m = np.zeros(diameters_m.shape)
-    args = (diameters_m, per_size, streak_m, focal_px, solid_px)
+    args = (diameters_m, per_size, streak_m, focal_px, solid_px, half_m)
     limits = (near_m, least_m, far_m, reach_m)
     low, high = faintest, 1.0
     count = _fill_reach(*args, low, *limits)
@@ -122,18 +157,7 @@ def solve_reach(
         else:
             high = middle
     count = _fill_reach(*args, high, *limits)
-    if count > 0.95 * budget:
-        return high, reach_m, count
-    nearer, farther = least_m, far_m
-    for _ in range(24):
-        middle = 0.5 * (nearer + farther)
-        if _fill_reach(*args, low, near_m, least_m, middle, reach_m) > budget:
-            farther = middle
-        else:
-            nearer = middle
-    if _fill_reach(*args, low, near_m, least_m, nearer, reach_m) < count:
-        return high, reach_m, _fill_reach(*args, high, *limits)
-    return low, reach_m, _fill_reach(*args, low, near_m, least_m, nearer, reach_m)
+    return high, reach_m, count
 
 
 @compiled
@@ -356,6 +380,7 @@ def _record(c, words, places, fill, view, motion, looks, found, out):
         passes = (z >= view.near_m) & (z <= view.reach_m[c, q])
         passes &= (x >= left * z - pad) & (x <= right * z + pad)
         passes &= (y >= top * z - pad) & (y <= bottom * z + pad)
+        passes &= (abs(x) <= view.steepest[0] * z) & (abs(y) <= view.steepest[1] * z)
         if not passes:
             continue
         if found < capacity:

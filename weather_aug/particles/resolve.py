@@ -1,9 +1,9 @@
 """Which particles a camera resolves; what it does not resolve becomes extinction.
 
-A particle is drawn where its pixel opacity is at least `alpha_min`; the rest of the population is a
-veil in closed form, so that the optical depth of both together is right at any particle budget.
-Drawn particles fade in behind the near limit, out before their reach, and in when the density
-rises, so that none pops up; the veil accounts for that too.
+A particle is drawn where its pixel opacity is at least `alpha_min` times a factor that doubles at
+30 m; the rest of the population is a veil in closed form, so that the optical depth of both
+together is right at any particle budget. Drawn particles fade in behind the near limit, out before
+their reach, and in when the density rises, so that none pops up; the veil accounts for that too.
 """
 
 from __future__ import annotations
@@ -23,17 +23,28 @@ NEAR_M = 0.5
 """Nearer particles are drops on the lens or behind the bonnet, not in the air."""
 NEAR_FULL_M = 0.7
 """The opacity of particles rises from 0 at the near limit to its full value here."""
+NEAR_SWEEPS = 1.5
+"""A particle that comes nearer by 1 / this of its depth while the shutter is open would sweep over
+the picture as no straight streak does; where that is farther than `NEAR_M`, it is the near limit,
+and the near fade is stretched alike."""
+MOST_TURN_RAD = 0.1
+"""A camera that turns by more while its shutter is open smears its whole picture; streaks are drawn
+as for this."""
 FADE_SHARE = 0.15
 """Share of its reach, at the end, over which the opacity of a particle falls to 0."""
 ARRIVALS = (0.25, 0.1)
 """While the density rises, a particle of a hash cell of mean count m appears over the arrival of
 this many later ones: 0.25 + 0.1 m. Dense cells thus let theirs appear over a tenth of the rate."""
-LEAST_REACH_M = NEAR_FULL_M / (1.0 - FADE_SHARE)
-"""A size with a shorter reach is not drawn, so that the two fades never overlap."""
+LEAST_REACH = NEAR_FULL_M / NEAR_M / (1.0 - FADE_SHARE)
+"""A size whose reach is less than this times the near limit is not drawn, so that the two fades
+never overlap."""
 FAR_M = 60.0
 """No particle is drawn beyond."""
 FAINTEST_ALPHA = 0.01
 """About 2.5 of 255 levels: fainter particles cannot be seen and are never drawn."""
+HALF_DEPTH_M = 30.0
+"""A particle this far must be twice as opaque as one at the lens to be drawn: what is near carries
+the look, and the reach of each size changes without leaps."""
 DEPTH_BINS = 1024
 
 Float32 = NDArray[np.float32]
@@ -51,6 +62,13 @@ class Resolved:
     """Particles drawn in the whole picture, on average, those that fade included."""
     optical_depth: Float32
     """(DEPTH_BINS + 1,) of drawn particles, on the axis, up to the depth k / DEPTH_BINS * FAR_M."""
+    near_m: float = NEAR_M
+    """No particle is drawn nearer."""
+
+    @property
+    def near_full_m(self) -> float:
+        """Where the near fade ends."""
+        return self.near_m * (NEAR_FULL_M / NEAR_M)
 
 
 def resolve(
@@ -100,7 +118,9 @@ def _resolved(
     """`resolve` of plain numbers: the arrays come as bytes, to be compared and hashed."""
     diameters_m = np.frombuffer(diameters).reshape(shape).copy()
     per_size = np.frombuffer(density) / shape[1]
-    across = _across_picture(picture, np.frombuffer(relative).reshape(-1, 3))
+    velocity = np.frombuffer(relative).reshape(-1, 3)
+    across = _across_picture(picture, velocity)
+    near_m = max(NEAR_M, NEAR_SWEEPS * exposure_s * float(np.abs(velocity[:, 2]).max()))
     fx, fy, _, _, width, height = picture
     alpha_min, reach_m, count = kernels.solve_reach(
         diameters_m,
@@ -108,20 +128,37 @@ def _resolved(
         across * exposure_s,
         float(np.sqrt(fx * fy)),
         width * height / (fx * fy),
+        HALF_DEPTH_M,
         float(max_particles),
         FAINTEST_ALPHA,
-        NEAR_M,
-        LEAST_REACH_M,
+        near_m,
+        LEAST_REACH * near_m,
         FAR_M,
     )
     opaque = per_size * np.frombuffer(drawn_share)
     optical_depth = kernels.resolved_optical_depth(
-        diameters_m, opaque, reach_m, NEAR_M, NEAR_FULL_M, FADE_SHARE, FAR_M, DEPTH_BINS
+        diameters_m,
+        opaque,
+        reach_m,
+        near_m,
+        near_m * NEAR_FULL_M / NEAR_M,
+        FADE_SHARE,
+        FAR_M,
+        DEPTH_BINS,
     )
     reach_m = reach_m.astype(np.float32)
     for array in (reach_m, optical_depth):
         array.flags.writeable = False
-    return Resolved(alpha_min, reach_m, count, optical_depth)
+    return Resolved(alpha_min, reach_m, count, optical_depth, near_m)
+
+
+def shutter_turning_rad_per_s(camera: Camera) -> Float64:
+    """(3,) how fast the camera turns, at most `MOST_TURN_RAD` while its shutter is open."""
+    turn_rad = float(np.linalg.norm(camera.angular_velocity_rad_per_s)) * camera.exposure_s
+    turning: Float64 = camera.angular_velocity_rad_per_s * min(
+        1.0, MOST_TURN_RAD / max(turn_rad, 1e-12)
+    )
+    return turning
 
 
 def arrivals(mean_per_cell: Float64) -> Float64:

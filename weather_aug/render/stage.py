@@ -15,7 +15,7 @@ from weather_aug.clip.types import Camera
 from weather_aug.colour import LUMINANCE, SRGB_LEVELS_LINEAR
 from weather_aug.edit.physical.overcast import ZENITH_GAIN, tone
 from weather_aug.particles.field import ParticleField, Window
-from weather_aug.particles.resolve import DEPTH_BINS, FAR_M
+from weather_aug.particles.resolve import DEPTH_BINS, FAR_M, shutter_turning_rad_per_s
 from weather_aug.particles.shelter import Shelter
 from weather_aug.render.fields import RigMotion, published_splats, splats_of
 from weather_aug.render.fog import fog_volume
@@ -221,7 +221,7 @@ def optics_of(camera: Camera, up_world: Float64) -> Optics:
         *camera.principal_px,
         camera.exposure_s,
         camera.aperture_m,
-        *camera.angular_velocity_rad_per_s,
+        *shutter_turning_rad_per_s(camera),
         *up,
         camera.width * camera.height,
     )

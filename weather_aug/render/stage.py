@@ -17,10 +17,14 @@ from weather_aug.edit.physical.overcast import ZENITH_GAIN, tone
 from weather_aug.particles.field import ParticleField, Window
 from weather_aug.particles.resolve import DEPTH_BINS, FAR_M, shutter_turning_rad_per_s
 from weather_aug.particles.shelter import Shelter
-from weather_aug.render.fields import RigMotion, published_splats, splats_of
+from weather_aug.render.fields import RigMotion, published_grey, published_splats, splats_of
 from weather_aug.render.fog import fog_volume
 from weather_aug.render.froxels import FogVolume, even_fog
-from weather_aug.render.label import HAZY_TRANSMITTANCE, least_linear_contrast
+from weather_aug.render.label import (
+    HAZY_TRANSMITTANCE,
+    LEAST_CONTRAST_LEVELS,
+    least_linear_contrast,
+)
 from weather_aug.render.light import Ambience
 from weather_aug.render.medium import SPRAY_HEIGHT_M, Medium, Optics, optical_depth
 from weather_aug.render.options import RenderOptions
@@ -69,6 +73,14 @@ class _Look(NamedTuple):
     overcast: float
     encoded: float
     """1 where colours stay in sRGB."""
+    veil: float | None = None
+    """Grey in sRGB that hides surfaces, where colours stay in sRGB; else the airlight does."""
+
+    def contrast(self, airlight: Float64) -> tuple[Float64, float]:
+        """Colour (3,) that hides surfaces, and the least difference from it that can be seen."""
+        if self.veil is None:
+            return airlight, least_linear_contrast(airlight)
+        return np.full(3, self.veil), LEAST_CONTRAST_LEVELS / 255
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +142,9 @@ class Stage:
             self._optics,
             self.window,
         )
-        encoded = _Look(np.arange(256) / 255, np.eye(3), 0.0, 1.0)
+        # What hides a surface here is the release's grey, and colours differ in sRGB.
+        grey = published_grey(self.weather, self.options)
+        encoded = _Look(np.arange(256) / 255, np.eye(3), 0.0, 1.0, grey)
         return self._run(self._background(), self._clear_air, encoded, splats)
 
     @property
@@ -184,7 +198,8 @@ class Stage:
         splats, band_starts = split_by_band(splats, self.window, -(-height // BAND_ROWS))
         sky_luminance = max(float(self.ambience.sky @ LUMINANCE), 0.05)
         sky = (look.overcast, sky_luminance, ZENITH_GAIN, look.encoded)
-        limits = (least_linear_contrast(self.ambience.airlight), HAZY_TRANSMITTANCE)
+        veil, contrast = look.contrast(self.ambience.airlight)
+        limits = (contrast, HAZY_TRANSMITTANCE)
         levels = np.empty((3, height, (width + 15) // 16 * 16), np.uint8)
         through = np.empty((height, width), np.float32)
         distinct = np.empty((height, width), np.uint8)
@@ -200,7 +215,7 @@ class Stage:
             look.curve.astype(np.float32),
             look.matrix.astype(np.float32),
             Tone(*(np.float32(v) for v in sky)),
-            self.ambience.airlight.astype(np.float32),
+            veil.astype(np.float32),
             splats,
             band_starts,
             tuple(np.float32(v) for v in limits),

@@ -14,21 +14,20 @@ from torch import Tensor
 
 from weather_aug.clip.types import Camera
 from weather_aug.render.batch_medium import AirColumn
-from weather_aug.render.project import FAINTEST, MOST_PARTS
-
-PIXEL_FILTER_PX2 = 0.3
-MOST_OPAQUE = 0.99
-FOCUS_M = 6.0
-LONG_SWEEP_PX = 12.0
-WIDE_STREAK_PX = 1.0
-SWEEP_PER_PART = 3.0
-"""Sweep of a part in standard deviations of the footprint."""
-WHOLE_SPREAD = 1.0 / 12.0
-"""Variance of a uniform sweep of length one."""
-PART_SPREAD = 0.2
-"""Of a part, which overlaps its neighbours so that their sum does not ripple."""
-LARGE_SHARE = 1e-3
-"""A footprint of more than this share of the picture can hide a surface."""
+from weather_aug.render.project import (
+    DEFOCUS_VARIANCE,
+    FAINTEST,
+    FOCUS_M,
+    LARGE_SHARE,
+    LONG_SWEEP_PX,
+    MOST_OPAQUE,
+    MOST_PARTS,
+    PART_SPREAD,
+    PIXEL_FILTER_PX2,
+    SWEEP_PER_PART,
+    WHOLE_SPREAD,
+    WIDE_STREAK_PX,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +113,7 @@ def project(
     qx, qy = _sweep_px(rows, camera)
     a0, b0, c0 = _sharp_covariance(rows[:, 6:12], tx, ty, sx, sy)
     defocus = camera.aperture_m * fx * (1.0 / z - 1.0 / FOCUS_M)
-    soft = PIXEL_FILTER_PX2 + defocus * defocus / 16.0
+    soft = PIXEL_FILTER_PX2 + defocus * defocus * DEFOCUS_VARIANCE
     i, parts, place = _cut(_part_counts(torch.hypot(qx, qy), 0.5 * (a0 + c0) + soft))
     px, py = qx[i] / parts, qy[i] / parts
     spread = torch.where(parts == 1, WHOLE_SPREAD, PART_SPREAD)

@@ -26,6 +26,7 @@ from weather_aug.render.froxels import (
     slice_depths_m,
     volume_of,
 )
+from weather_aug.render.medium import LOWEST_HEIGHTS
 from weather_aug.weather import Weather
 
 Float32 = NDArray[np.float32]
@@ -338,8 +339,8 @@ def _add_puffs(
     # A Gaussian in exponential air: the mean over all puffs at a height is the air's own density
     # there only if each is thinned by the second term, too.
     thinning = found[:, 4] / scale_height_m + 0.5 * (sigma_m / scale_height_m) ** 2
-    # Below eight scale heights the even fog thickens no more, either.
-    alive = (drawn > 0) & (found[:, 2] > -puffs.CUT * sigma_m) & (thinning > -8.0)
+    # Farther below, the even fog thickens no more, either.
+    alive = (drawn > 0) & (found[:, 2] > -puffs.CUT * sigma_m) & (thinning > LOWEST_HEIGHTS)
     index, thinning, drawn = index[alive], thinning[alive], drawn[alive]
     puffs.add_puffs(
         found[alive],

@@ -14,6 +14,24 @@ MOST_PARTS = 16
 """A sweep is cut into no more parts than this."""
 FAINTEST = 1.0 / 255.0
 """Opacity at which a particle's footprint is cut."""
+MOST_OPAQUE = 0.99
+PIXEL_FILTER_PX2 = 0.3
+FOCUS_M = 6.0
+DEFOCUS_VARIANCE = 1.0 / 16.0
+"""Of a disc of diameter one."""
+WHOLE_SPREAD = 1.0 / 12.0
+"""Variance of a uniform sweep of length one."""
+PART_SPREAD = 0.2
+"""Of a part, which overlaps its neighbours: as wide as 1/12 says, their sum would ripple by a
+third."""
+LONG_SWEEP_PX = 12.0
+WIDE_STREAK_PX = 1.0
+SWEEP_PER_PART = 3.0
+"""Sweep of a part in standard deviations of the footprint."""
+LARGE_SHARE = 1e-3
+"""A footprint of more than this share of the picture can hide a surface."""
+LARGE_PEAK = 0.5
+"""Only one whose peak is above this can."""
 
 
 @compiled
@@ -66,7 +84,7 @@ def _shape(p, optics, medium, resolved_depth, compensate, out):
     """Footprints of 16 particles, all at once: without branches, so that they go in one vector."""
     one, two = np.float32(1.0), np.float32(2.0)
     t = optics.exposure_s
-    large_area = np.float32(1e-3 / np.pi) * optics.area_px
+    large_area = np.float32(LARGE_SHARE / np.pi) * optics.area_px
     # Looked up beforehand: a look-up in the long loop would keep it from being one vector.
     for k in range(16):
         out[112 + k] = carried_at(p[32 + k], resolved_depth, medium)
@@ -91,11 +109,10 @@ def _shape(p, optics, medium, resolved_depth, compensate, out):
         c0 = sy * sy * (yy - jy * (two * yz - jy * zz))
         sharp = a0 * c0 - b0 * b0
         sharp = sharp if sharp > np.float32(1e-20) else np.float32(1e-20)
-        blur = optics.aperture_m * optics.fx * (inverse - np.float32(1.0 / 6.0))
-        soft = np.float32(0.3) + blur * blur * np.float32(0.0625)
+        blur = optics.aperture_m * optics.fx * (inverse - np.float32(1.0 / FOCUS_M))
+        soft = np.float32(PIXEL_FILTER_PX2) + blur * blur * np.float32(DEFOCUS_VARIANCE)
         parts = _parts(qx * qx + qy * qy, np.float32(0.5) * (a0 + c0) + soft)
-        # Parts overlap: as wide as 1/12 says, their sum would ripple by a third.
-        spread = np.float32(1.0 / 12.0) if parts == one else np.float32(0.2)
+        spread = np.float32(WHOLE_SPREAD) if parts == one else np.float32(PART_SPREAD)
         share = one / parts
         qx, qy = qx * share, qy * share
         a, c = a0 + soft + spread * qx * qx, c0 + soft + spread * qy * qy
@@ -108,12 +125,12 @@ def _shape(p, optics, medium, resolved_depth, compensate, out):
         # What the cut of the footprint takes away, so that the sum over the pixels is right.
         given_back = np.float32(FAINTEST) if compensate else np.float32(0.0)
         peak = p[192 + k] * shrunk + given_back
-        peak = peak if peak < np.float32(0.99) else np.float32(0.99)
+        peak = peak if peak < np.float32(MOST_OPAQUE) else np.float32(MOST_OPAQUE)
         reach2 = two * log(peak * np.float32(1.0 / FAINTEST))
         drawn = reach2 if reach2 > np.float32(0.0) else np.float32(0.0)
         aside = np.float32(0.5) * (parts - one)
         half_v = np.sqrt(drawn * c)
-        over = (drawn * np.sqrt(det) * parts > large_area) & (peak > np.float32(0.5))
+        over = (drawn * np.sqrt(det) * parts > large_area) & (peak > np.float32(LARGE_PEAK))
         tau = near_optical_depth(z, tx, ty, optics, medium, out[112 + k])
         out[k] = optics.cx + optics.fx * tx
         out[16 + k] = optics.cy + optics.fy * ty
@@ -177,10 +194,12 @@ def _paint(shape, lane, parts, colour, airlight, splats, count):
 @inlined
 def _parts(sweep2, variance):
     """Into how many parts a sweep is cut, from its squared length and the mean variance."""
-    one = np.float32(1.0)
-    wanted = np.ceil(np.sqrt(sweep2 / (np.float32(9.0) * variance)))
+    step2 = np.float32(SWEEP_PER_PART * SWEEP_PER_PART)
+    long2 = np.float32(LONG_SWEEP_PX * LONG_SWEEP_PX)
+    wide2 = np.float32(WIDE_STREAK_PX * WIDE_STREAK_PX)
+    wanted = np.ceil(np.sqrt(sweep2 / (step2 * variance)))
     wanted = wanted if wanted < np.float32(MOST_PARTS) else np.float32(MOST_PARTS)
-    return wanted if (sweep2 > np.float32(144.0)) & (variance > one) else one
+    return wanted if (sweep2 > long2) & (variance > wide2) else np.float32(1.0)
 
 
 @compiled

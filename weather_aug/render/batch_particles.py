@@ -29,7 +29,7 @@ from weather_aug.render.fields import RigMotion, fields_of, resolved_of, splats_
 from weather_aug.render.light import Ambience, particle_colour
 from weather_aug.render.medium import Medium, Optics
 from weather_aug.render.options import RenderOptions
-from weather_aug.render.project import BAND_ROWS, split_by_band
+from weather_aug.render.project import BAND_ROWS, LARGE, split_by_band
 from weather_aug.render.stage import medium_of, optics_of
 from weather_aug.render.tile import TILE_FLOATS, blend_band, cover_splat
 from weather_aug.weather import Weather
@@ -167,7 +167,7 @@ def _compiled_layer(particles: Particles, depth_m: Tensor) -> Layer:
         drawn = planes[: rows.stop - top, :, :width]
         drawn[:, :3], drawn[:, 3], drawn[:, 4] = 0.0, 1.0, depth[rows]
         blend_band(mine, window, top, planes, tiles)
-        for large in mine[mine[:, 11] > 0]:
+        for large in mine[mine[:, LARGE] > 0]:
             cover_splat(large, (top, rows.stop), window, planes, covered)
         light[:, rows], through[rows] = drawn[:, :3].transpose(1, 0, 2), drawn[:, 3]
     return Layer(layer.light, layer.through, torch.from_numpy(covered).bool())

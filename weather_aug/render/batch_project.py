@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from weather_aug.clip.types import Camera
+from weather_aug.particles.field import COVARIANCE, OPACITY, VELOCITY
 from weather_aug.render.batch_medium import AirColumn
 from weather_aug.render.project import (
     DEFOCUS_VARIANCE,
@@ -111,7 +112,7 @@ def project(
     x, y, z = rows[:, 0], rows[:, 1], rows[:, 2]
     tx, ty, sx, sy = x / z, y / z, fx / z, fy / z
     qx, qy = _sweep_px(rows, camera)
-    a0, b0, c0 = _sharp_covariance(rows[:, 6:12], tx, ty, sx, sy)
+    a0, b0, c0 = _sharp_covariance(rows[:, COVARIANCE:OPACITY], tx, ty, sx, sy)
     defocus = camera.aperture_m * fx * (1.0 / z - 1.0 / FOCUS_M)
     soft = PIXEL_FILTER_PX2 + defocus * defocus * DEFOCUS_VARIANCE
     i, parts, place = _cut(_part_counts(torch.hypot(qx, qy), 0.5 * (a0 + c0) + soft))
@@ -123,7 +124,7 @@ def project(
     det = a * c - b * b
     det_sharp = (a0 * c0 - b0 * b0).clamp(min=0.0)[i]
     fainter = torch.sqrt(det_sharp / det) if compensate else torch.ones_like(det)
-    peak = (rows[i, 12] * fainter / parts + FAINTEST).clamp(max=MOST_OPAQUE)
+    peak = (rows[i, OPACITY] * fainter / parts + FAINTEST).clamp(max=MOST_OPAQUE)
     reach2 = 2.0 * torch.log(peak / FAINTEST)
     u, v = cx + fx * tx[i] + qx[i] * place, cy + fy * ty[i] + qy[i] * place
     half = torch.sqrt(reach2.clamp(min=0.0)[:, None] * torch.stack([a, c], dim=1))
@@ -148,9 +149,10 @@ def _sweep_px(rows: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Motion of each particle on the picture while the shutter is open, pixels."""
     turn_x, turn_y, turn_z = (float(w) for w in camera.angular_velocity_rad_per_s)
     x, y, z = rows[:, 0], rows[:, 1], rows[:, 2]
-    ux = rows[:, 3] - (turn_y * z - turn_z * y)
-    uy = rows[:, 4] - (turn_z * x - turn_x * z)
-    uz = rows[:, 5] - (turn_x * y - turn_y * x)
+    vx, vy, vz = rows[:, VELOCITY:COVARIANCE].unbind(1)
+    ux = vx - (turn_y * z - turn_z * y)
+    uy = vy - (turn_z * x - turn_x * z)
+    uz = vz - (turn_x * y - turn_y * x)
     fx, fy = camera.focal_px
     steps = camera.exposure_s / z
     return fx * steps * (ux - x / z * uz), fy * steps * (uy - y / z * uz)

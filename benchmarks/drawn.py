@@ -10,6 +10,7 @@ import numba
 import numpy as np
 
 from weather_aug.render import stage
+from weather_aug.render.project import CONIC, HALF_HEIGHT, HALF_WIDTH, LEAN, LIGHT, REACH2, U, V
 
 
 class Drawn(NamedTuple):
@@ -36,7 +37,7 @@ def drawn(run: Callable[[], object], height: int, width: int) -> Drawn:
         run()
     splats = seen[-1]
     # The parts of a streak follow each other and share shape and depth.
-    new = (np.diff(splats[:, 2:8], axis=0) != 0).any(axis=1)
+    new = (np.diff(splats[:, CONIC:LIGHT], axis=0) != 0).any(axis=1)
     particles = int(new.sum()) + 1 if len(splats) else 0
     return Drawn(particles, len(splats), int(fragments(splats, height, width)))
 
@@ -47,13 +48,15 @@ def fragments(splats, height, width):
     count = 0
     for m in range(splats.shape[0]):
         s = splats[m]
-        half_u = s[13] + abs(s[14]) * s[12]
-        first, last = max(int(s[1] - s[12]), 0), min(int(s[1] + s[12]) + 1, height - 1)
-        start, stop = max(int(s[0] - half_u), 0), min(int(s[0] + half_u) + 1, width - 1)
+        u, v, half_v = s[U], s[V], s[HALF_HEIGHT]
+        a, b, c = s[CONIC], s[CONIC + 1], s[CONIC + 2]
+        half_u = s[HALF_WIDTH] + abs(s[LEAN]) * half_v
+        first, last = max(int(v - half_v), 0), min(int(v + half_v) + 1, height - 1)
+        start, stop = max(int(u - half_u), 0), min(int(u + half_u) + 1, width - 1)
         for y in range(first, last + 1):
-            dy = np.float32(y) - s[1]
+            dy = np.float32(y) - v
             for x in range(start, stop + 1):
-                dx = np.float32(x) - s[0]
-                power = (s[2] * dx + np.float32(2.0) * s[3] * dy) * dx + s[4] * dy * dy
-                count += power <= s[5]
+                dx = np.float32(x) - u
+                power = (a * dx + np.float32(2.0) * b * dy) * dx + c * dy * dy
+                count += power <= s[REACH2]
     return count

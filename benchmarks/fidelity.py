@@ -17,7 +17,7 @@ from weather_aug.clip.types import Frame
 from weather_aug.particles.resolve import DEPTH_BINS, FAR_M
 from weather_aug.render.compose import render
 from weather_aug.render.fields import fields_of
-from weather_aug.render.light import Ambience, rain_colour, snow_colour
+from weather_aug.render.light import Ambience, particle_colour
 from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
 
@@ -26,7 +26,6 @@ HEIGHT, WIDTH = 96, 192
 OPTIONS = RenderOptions(1_500)
 SEED = 1
 WEATHERS = {"fog + rain": RAIN, "fog + snow": SNOW}
-COLOURS = {"rain": rain_colour, "snow": snow_colour}
 
 
 def measure() -> dict[str, Any]:
@@ -76,7 +75,7 @@ def reference_image(
         )
         return np.exp(-depth)
 
-    own = COLOURS[field.population.kind](ambience)
+    own = particle_colour(field.population.kind, ambience)
 
     def colour_at(position: Any) -> Any:
         share = through(position[2], position[:2] / position[2])

@@ -5,11 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from render_scene import FORWARD, make_camera
+from scipy.interpolate import interpn
 
 from weather_aug._compiled import compiled
+from weather_aug.air import Air
 from weather_aug.errors import ArgumentError
-from weather_aug.render.fog import fog_volume
-from weather_aug.render.froxels import Z_FAR_M, even_layer, share_at, share_row
+from weather_aug.render.fog import fog_volume, fog_volume_of
+from weather_aug.render.froxels import Z_FAR_M, even_fog, even_layer, share_row
+from weather_aug.weather import Weather
 
 WIDTH, HEIGHT = 96, 64
 
@@ -130,18 +133,42 @@ def test_nearly_even_fog_has_the_share_one():
 
 def test_even_fog_and_no_fog_need_no_volume():
     camera = make_camera(WIDTH, HEIGHT)
-    assert volume_for(camera, patchiness=0.0, puff_share=0.0) is None
-    assert volume_for(camera, fog_per_m=0.0) is None
+    assert len(volume_for(camera, patchiness=0.0, puff_share=0.0).share) == 0
+    assert len(volume_for(camera, fog_per_m=0.0).share) == 0
 
 
-def test_a_single_place_gives_what_its_row_gives():
+def test_a_weathers_fog_rides_on_its_air():
+    """Street axes into world axes: a quarter turn, and the drift along the street is along y."""
     camera = tilted_camera()
-    volume = volume_for(camera)
+    window = (0, 0, HEIGHT, WIDTH)
+    axes = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    air = Air(wind_m_per_s=(0.0, 0.0, 0.0), drift_m=(7.3, -2.1, 0.4), wet_s=0.0)
+    weather = Weather(visibility_m=90.0, fog_scale_height_m=25.0, fog_patchiness=0.6, fog_puffs=0.3)
+    found = fog_volume_of(weather, camera, window, 5, air, axes)
+    expected = volume_for(
+        camera,
+        fog_per_m=weather.fog_per_m,
+        axes_world=axes,
+        drift_world_m=np.array([2.1, 7.3, 0.4]),
+    )
+    np.testing.assert_array_equal(expected.share, found.share)
+    even = replace(weather, fog_patchiness=0.0, fog_puffs=0.0)
+    assert fog_volume_of(even, camera, window, 5, air, axes) is even_fog()
+
+
+def interpolated(volume, depth):
+    """The shares of a whole picture by scipy: linear in row, in column and in 1 / depth."""
+    rows, columns = np.indices(depth.shape) * float(volume.nodes_per_px)
+    nearness = np.minimum(1 / depth, volume.inverse_depth[0])
+    nodes = (-volume.inverse_depth, *(np.arange(count) for count in volume.share.shape[1:]))
+    return interpn(nodes, volume.share, np.stack([-nearness, rows, columns], axis=-1))
+
+
+def test_shares_are_interpolated_between_the_nodes():
+    volume = volume_for(tilted_camera())
     depth = np.random.default_rng(2).uniform(0.5, 400, (HEIGHT, WIDTH)).astype(np.float32)
-    rows = looked_up(volume, depth)
-    for y, x in ((0, 0), (63, 95), (31, 50), (17, 3)):
-        at = share_at(volume, np.float32(x), np.float32(y), depth[y, x])
-        assert at == pytest.approx(rows[y, x], abs=1e-5)
+    found = looked_up(volume, depth)
+    np.testing.assert_allclose(interpolated(volume, depth), found, atol=1e-5)
 
 
 def test_the_fog_rides_on_the_wind():

@@ -11,7 +11,7 @@ from weather_aug.air import air_of
 from weather_aug.render.compose import render
 from weather_aug.render.fields import fields_of
 from weather_aug.render.froxels import even_fog
-from weather_aug.render.light import rain_colour, snow_colour
+from weather_aug.render.light import particle_colour, rain_colour, snow_colour
 from weather_aug.render.medium import Medium
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.render.project import BAND_ROWS, FAINTEST, log, sorted_in_blocks, split_by_band
@@ -310,12 +310,12 @@ def test_whole_frame_agrees_with_the_reference(weather, ambience):
         return np.exp(-optical_depth(z, ray, up, 0.0, 0.0, haze, extinction, carried))
 
     optical_depth = reference.optical_depth
-    colour = {"rain": rain_colour, "snow": snow_colour}[field.population.kind]
+    colour = particle_colour(field.population.kind, ambience)
 
     def colour_at(position):
         ray = position[:2] / position[2]
         through = air(position[2], ray)
-        return through * colour(ambience) + (1 - through) * ambience.airlight
+        return through * colour + (1 - through) * ambience.airlight
 
     through = air(depth.astype(float), reference.rays(camera))
     light = through[..., None] * reference.linear(image)

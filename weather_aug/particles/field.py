@@ -38,6 +38,8 @@ from weather_aug.particles.tumble import shape_turns, shapes_in
 MAX_PARTICLES = 1_000_000
 RECORD = 13
 """Numbers of a particle: position, velocity, covariance (xx, xy, xz, yy, yz, zz), opacity."""
+VELOCITY, COVARIANCE, OPACITY = 3, 6, 12
+"""Where they begin in a particle's record; its position comes first."""
 BLUR_PX = 6.0
 """Reach of the pixel filter around a particle."""
 BEYOND_PICTURE = 1.0

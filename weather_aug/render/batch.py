@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -37,7 +36,7 @@ from weather_aug.render.batch_medium import AirColumn, pixel_rays
 from weather_aug.render.batch_particles import Job, Particles, particle_layer, splatting_on
 from weather_aug.render.batch_splat import Layer
 from weather_aug.render.fields import RigMotion
-from weather_aug.render.fog import fog_volume
+from weather_aug.render.fog import fog_volume_of
 from weather_aug.render.label import least_linear_contrast
 from weather_aug.render.light import Ambience
 from weather_aug.render.medium import FAR_DEPTH_M
@@ -183,7 +182,9 @@ def _rendered(image: Tensor, depth: Tensor, label: Tensor | None, job: Job) -> _
     shaded, gap = (torch.cat(parts, dim=-2) for parts in zip(*bands, strict=True))
     through = clear * layer.through.to(clear.dtype)
     distinct = gap * through >= least_linear_contrast(job.ambience.airlight)
-    honest, invalid = batch_shade.readable(label, through, distinct, layer.covered)
+    honest, invalid = batch_shade.readable(
+        label, torch.isinf(depth), through, distinct, layer.covered
+    )
     return _Shot(shaded, honest, invalid, through)
 
 
@@ -206,20 +207,11 @@ def _shaded(
 
 def _clear_share(depth: Tensor, rays: tuple[Tensor, Tensor], air: AirColumn, job: Job) -> Tensor:
     """(H, W) transmittance of the air alone, patches and puffs of the fog included."""
-    weather, axes = job.weather, job.ambience.axes_world
-    volume = fog_volume(
-        job.camera,
-        (0, 0, job.camera.height, job.camera.width),
-        fog_per_m=weather.fog_per_m,
-        scale_height_m=weather.fog_scale_height_m,
-        patchiness=weather.fog_patchiness,
-        puff_share=weather.fog_puffs,
-        seed=job.seed,
-        axes_world=axes,
-        drift_world_m=np.asarray(job.air.drift_m) @ axes,
-    )
+    camera, axes = job.camera, job.ambience.axes_world
+    whole = (0, 0, camera.height, camera.width)
+    volume = fog_volume_of(job.weather, camera, whole, job.seed, job.air, axes)
     reach_m = air.reach_m(depth, *rays)
-    share = None if volume is None else fog_shares(volume, reach_m)
+    share = fog_shares(volume, reach_m) if len(volume.share) else None
     return torch.exp(-air.optical_depth(reach_m, *rays, share))
 
 

@@ -21,7 +21,8 @@ from torch.nn import functional
 from weather_aug._extras import require
 from weather_aug.errors import MissingExtraError, printable
 from weather_aug.render.batch_project import Splats
-from weather_aug.render.batch_splat import NEAR_EDGE_M, Layer, empty_layer, splat
+from weather_aug.render.batch_splat import Layer, empty_layer, splat
+from weather_aug.render.tile import NEAR_EDGE_M
 
 SLABS = 4
 TILE_PX = 16

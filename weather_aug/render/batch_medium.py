@@ -11,14 +11,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from weather_aug.clip.types import Camera
-from weather_aug.render.medium import FAR_DEPTH_M, SPRAY_HEIGHT_M, Medium, Optics
-
-LAYER_M = 1000.0
-"""Height of the layer of weather: a ray to the sky ends at its top."""
-LONGEST_M = 20_000.0
-FLATTEST_SINE = 0.05
-THICKEST = 60.0
-"""Optical depth beyond which no light is left in any number format."""
+from weather_aug.render.medium import (
+    FAR_DEPTH_M,
+    FLATTEST_SINE,
+    LAYER_M,
+    LONGEST_M,
+    LOWEST_HEIGHTS,
+    SPRAY_HEIGHT_M,
+    THICKEST,
+    Medium,
+    Optics,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +111,7 @@ class AirColumn:
 
 def layer_share(heights: Tensor) -> Tensor:
     """Mean of exp(-h) along a ray that climbs by `heights` scale heights, (1 - exp(-h)) / h."""
-    heights = heights.clamp(min=-8.0)
+    heights = heights.clamp(min=LOWEST_HEIGHTS)
     level = heights == 0.0
     away = heights.masked_fill(level, 1.0)
     return (-torch.expm1(-away) / away).masked_fill(level, 1.0)

@@ -19,17 +19,17 @@ from weather_aug.air import Air
 from weather_aug.clip.types import Camera
 from weather_aug.errors import ArgumentError, printable
 from weather_aug.particles.field import ParticleField
-from weather_aug.particles.resolve import DEPTH_BINS, Resolved
+from weather_aug.particles.resolve import Resolved
 from weather_aug.particles.shelter import Shelter, exposed
 from weather_aug.render.batch_gsplat import splat_gsplat
 from weather_aug.render.batch_medium import AirColumn
 from weather_aug.render.batch_project import concatenated, project
 from weather_aug.render.batch_splat import Layer, empty_layer, splat
-from weather_aug.render.fields import RigMotion, fields_of, splats_of
-from weather_aug.render.light import Ambience, rain_colour, snow_colour
+from weather_aug.render.fields import RigMotion, fields_of, resolved_of, splats_of
+from weather_aug.render.light import Ambience, particle_colour
 from weather_aug.render.medium import Medium, Optics
 from weather_aug.render.options import RenderOptions
-from weather_aug.render.project import BAND_ROWS, split_by_band
+from weather_aug.render.project import BAND_ROWS, LARGE, split_by_band
 from weather_aug.render.stage import medium_of, optics_of
 from weather_aug.render.tile import TILE_FLOATS, blend_band, cover_splat
 from weather_aug.weather import Weather
@@ -37,7 +37,6 @@ from weather_aug.weather import Weather
 Float32 = NDArray[np.float32]
 
 SPLATTING = ("auto", "compiled", "torch", "gsplat")
-_COLOURS = {"rain": rain_colour, "snow": snow_colour}
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,11 +72,7 @@ class Particles:
         """As `render` takes them."""
         weather, axes = job.weather, job.ambience.axes_world
         fields = fields_of(weather, job.seed, job.air, axes, job.options, job.rig)
-        budget = job.options.max_particles // max(len(fields), 1)
-        resolved = [field.resolve(job.camera, budget) for field in fields]
-        carried = np.zeros(DEPTH_BINS + 1, np.float32)
-        for part in resolved:
-            carried = carried + part.optical_depth
+        resolved, carried = resolved_of(fields, job.camera, job.options.max_particles)
         optics = optics_of(job.camera, axes[2])
         medium = medium_of(weather, fields, job.ambience)
         return cls(job, fields, resolved, carried, optics, medium)
@@ -134,7 +129,7 @@ def particle_layer(particles: Particles, air: AirColumn, depth_m: Tensor) -> Lay
     airlight = depth_m.new_tensor(job.ambience.airlight)
     parts = []
     for index, field in enumerate(particles.fields):
-        colour = depth_m.new_tensor(_COLOURS[field.population.kind](particles.light))
+        colour = depth_m.new_tensor(particle_colour(field.population.kind, particles.light))
         records = torch.from_numpy(particles.records(index)).to(depth_m.device)
         parts.append(project(records, job.camera, air, colour, airlight))
     draw = splat if job.splatting == "torch" else splat_gsplat
@@ -172,7 +167,7 @@ def _compiled_layer(particles: Particles, depth_m: Tensor) -> Layer:
         drawn = planes[: rows.stop - top, :, :width]
         drawn[:, :3], drawn[:, 3], drawn[:, 4] = 0.0, 1.0, depth[rows]
         blend_band(mine, window, top, planes, tiles)
-        for large in mine[mine[:, 11] > 0]:
+        for large in mine[mine[:, LARGE] > 0]:
             cover_splat(large, (top, rows.stop), window, planes, covered)
         light[:, rows], through[rows] = drawn[:, :3].transpose(1, 0, 2), drawn[:, 3]
     return Layer(layer.light, layer.through, torch.from_numpy(covered).bool())

@@ -13,22 +13,23 @@ import torch
 from torch import Tensor
 
 from weather_aug.clip.types import Camera
+from weather_aug.particles.field import COVARIANCE, OPACITY, VELOCITY
+from weather_aug.particles.resolve import shutter_turning_rad_per_s
 from weather_aug.render.batch_medium import AirColumn
-from weather_aug.render.project import FAINTEST, MOST_PARTS
-
-PIXEL_FILTER_PX2 = 0.3
-MOST_OPAQUE = 0.99
-FOCUS_M = 6.0
-LONG_SWEEP_PX = 12.0
-WIDE_STREAK_PX = 1.0
-SWEEP_PER_PART = 3.0
-"""Sweep of a part in standard deviations of the footprint."""
-WHOLE_SPREAD = 1.0 / 12.0
-"""Variance of a uniform sweep of length one."""
-PART_SPREAD = 0.2
-"""Of a part, which overlaps its neighbours so that their sum does not ripple."""
-LARGE_SHARE = 1e-3
-"""A footprint of more than this share of the picture can hide a surface."""
+from weather_aug.render.project import (
+    DEFOCUS_VARIANCE,
+    FAINTEST,
+    FOCUS_M,
+    LARGE_SHARE,
+    LONG_SWEEP_PX,
+    MOST_OPAQUE,
+    MOST_PARTS,
+    PART_SPREAD,
+    PIXEL_FILTER_PX2,
+    SWEEP_PER_PART,
+    WHOLE_SPREAD,
+    WIDE_STREAK_PX,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,9 +113,9 @@ def project(
     x, y, z = rows[:, 0], rows[:, 1], rows[:, 2]
     tx, ty, sx, sy = x / z, y / z, fx / z, fy / z
     qx, qy = _sweep_px(rows, camera)
-    a0, b0, c0 = _sharp_covariance(rows[:, 6:12], tx, ty, sx, sy)
+    a0, b0, c0 = _sharp_covariance(rows[:, COVARIANCE:OPACITY], tx, ty, sx, sy)
     defocus = camera.aperture_m * fx * (1.0 / z - 1.0 / FOCUS_M)
-    soft = PIXEL_FILTER_PX2 + defocus * defocus / 16.0
+    soft = PIXEL_FILTER_PX2 + defocus * defocus * DEFOCUS_VARIANCE
     i, parts, place = _cut(_part_counts(torch.hypot(qx, qy), 0.5 * (a0 + c0) + soft))
     px, py = qx[i] / parts, qy[i] / parts
     spread = torch.where(parts == 1, WHOLE_SPREAD, PART_SPREAD)
@@ -124,7 +125,7 @@ def project(
     det = a * c - b * b
     det_sharp = (a0 * c0 - b0 * b0).clamp(min=0.0)[i]
     fainter = torch.sqrt(det_sharp / det) if compensate else torch.ones_like(det)
-    peak = (rows[i, 12] * fainter / parts + FAINTEST).clamp(max=MOST_OPAQUE)
+    peak = (rows[i, OPACITY] * fainter / parts + FAINTEST).clamp(max=MOST_OPAQUE)
     reach2 = 2.0 * torch.log(peak / FAINTEST)
     u, v = cx + fx * tx[i] + qx[i] * place, cy + fy * ty[i] + qy[i] * place
     half = torch.sqrt(reach2.clamp(min=0.0)[:, None] * torch.stack([a, c], dim=1))
@@ -147,11 +148,12 @@ def project(
 
 def _sweep_px(rows: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Motion of each particle on the picture while the shutter is open, pixels."""
-    turn_x, turn_y, turn_z = (float(w) for w in camera.angular_velocity_rad_per_s)
+    turn_x, turn_y, turn_z = (float(w) for w in shutter_turning_rad_per_s(camera))
     x, y, z = rows[:, 0], rows[:, 1], rows[:, 2]
-    ux = rows[:, 3] - (turn_y * z - turn_z * y)
-    uy = rows[:, 4] - (turn_z * x - turn_x * z)
-    uz = rows[:, 5] - (turn_x * y - turn_y * x)
+    vx, vy, vz = rows[:, VELOCITY:COVARIANCE].unbind(1)
+    ux = vx - (turn_y * z - turn_z * y)
+    uy = vy - (turn_z * x - turn_x * z)
+    uz = vz - (turn_x * y - turn_y * x)
     fx, fy = camera.focal_px
     steps = camera.exposure_s / z
     return fx * steps * (ux - x / z * uz), fy * steps * (uy - y / z * uz)

@@ -93,17 +93,18 @@ def neighbourhood(mask: Tensor) -> Tensor:
 
 
 def readable(
-    label: Tensor | None, through: Tensor, distinct: Tensor, covered: Tensor
+    label: Tensor | None, far: Tensor, through: Tensor, distinct: Tensor, covered: Tensor
 ) -> tuple[Tensor | None, Tensor]:
     """Label for training (H, W) and invalid mask (H, W) uint8, by the rules of `render.label`.
 
     Args:
         label: (H, W) train ids of the clear picture, or None.
+        far: (H, W) bool, where the depth is endless: the sky, where nobody labelled.
         through: (H, W) share of the surface's light that reaches the pixel.
         distinct: (H, W) bool, where it still differs visibly from the airlight.
         covered: (H, W) bool, where a large particle hides the surface.
     """
-    surface = torch.ones_like(distinct) if label is None else label != SKY
+    surface = ~far if label is None else label != SKY
     near_distinct = neighbourhood(distinct & surface)
     lost = (through < LEAST_TRANSMITTANCE) | ((through < HAZY_TRANSMITTANCE) & ~near_distinct)
     unseen = (surface & lost) | covered

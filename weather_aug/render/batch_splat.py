@@ -16,12 +16,11 @@ import torch
 from torch import Tensor
 
 from weather_aug.render.batch_project import Splats
+from weather_aug.render.project import HIDING_ALPHA
+from weather_aug.render.tile import NEAR_EDGE_M
 
 FRAGMENTS_AT_ONCE = {"cpu": 2**16, "cuda": 2**20}
 """Fragments in memory at once, about 200 bytes each; few on a CPU, for its cache."""
-NEAR_EDGE_M = 0.1
-"""A particle fades out from this far in front of a surface to as far behind it."""
-HIDING_ALPHA = 0.5
 ONE = 2.0**36
 """Fixed point: resolves 1e-11, holds the sums of 2^26 fragments."""
 

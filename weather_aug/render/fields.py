@@ -14,9 +14,9 @@ from weather_aug.particles import statistics
 from weather_aug.particles.field import ParticleField, Window
 from weather_aug.particles.published import PublishedField
 from weather_aug.particles.published_presets import published_preset
-from weather_aug.particles.resolve import Resolved
+from weather_aug.particles.resolve import DEPTH_BINS, Resolved
 from weather_aug.particles.shelter import Shelter, exposed
-from weather_aug.render.light import Ambience, rain_colour, snow_colour
+from weather_aug.render.light import Ambience, particle_colour
 from weather_aug.render.medium import Medium, Optics
 from weather_aug.render.options import RenderOptions
 from weather_aug.render.project import project, sorted_in_blocks
@@ -27,7 +27,6 @@ Float64 = NDArray[np.float64]
 
 EWA_LIMIT = 1.3
 """A classic splat's shape is computed no farther outside the picture than this, as in 3DGS."""
-_COLOURS = {"rain": rain_colour, "snow": snow_colour}
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +69,27 @@ def fields_of(
     ]
 
 
+def resolved_of(
+    fields: Sequence[ParticleField], camera: Camera, max_particles: int
+) -> tuple[list[Resolved], Float32]:
+    """What the camera resolves of each field, and the optical depth that all of it carries.
+
+    Args:
+        fields: Of one moment; they share the budget evenly.
+        camera: Of the whole picture.
+        max_particles: Expected number of drawn particles of all fields together at the most.
+
+    Returns:
+        One `Resolved` per field, and (DEPTH_BINS + 1,) the sum of their optical depths.
+    """
+    budget = max_particles // max(len(fields), 1)
+    resolved = [field.resolve(camera, budget) for field in fields]
+    carried = np.zeros(DEPTH_BINS + 1, np.float32)
+    for part in resolved:
+        carried = carried + part.optical_depth
+    return resolved, carried
+
+
 def splats_of(
     camera: Camera,
     time_s: float,
@@ -105,7 +125,7 @@ def splats_of(
         )
         for field, part in zip(fields, resolved, strict=True)
     ]
-    colours = [_COLOURS[field.population.kind](light) for field in fields]
+    colours = [particle_colour(field.population.kind, light) for field in fields]
     return _projected(clouds, colours, optics, medium, carried, light.airlight, window, True)
 
 
@@ -117,6 +137,16 @@ def published_kinds(weather: Weather) -> list[str]:
         "fog": weather.fog_per_m,
     }
     return [kind for kind, rate in rates.items() if rate > 0]
+
+
+def published_grey(weather: Weather, options: RenderOptions) -> float:
+    """Mean grey of the release's particles for a weather, sRGB in [0, 1]."""
+    presets = [published_preset(_dataset(options), kind) for kind in published_kinds(weather)]
+    return float(np.mean([preset.grey_srgb for preset in presets])) if presets else 1.0
+
+
+def _dataset(options: RenderOptions) -> str:
+    return "nuscenes" if options.preset.endswith("nuscenes") else "waymo"
 
 
 def published_splats(
@@ -131,10 +161,9 @@ def published_splats(
     window: Window,
 ) -> Float32:
     """Splats (M, 16) of WeatherEdit's release; colours are its greys, in sRGB."""
-    dataset = "nuscenes" if options.preset.endswith("nuscenes") else "waymo"
     fields = [
         PublishedField(
-            published_preset(dataset, kind),
+            published_preset(_dataset(options), kind),
             seed,
             rig.world_from_first[:3, 3],
             axes_world,

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from weather_aug._checks import finite
 from weather_aug._keys import check_seed, key_of
+from weather_aug.air import Air
 from weather_aug.clip.types import Camera
 from weather_aug.particles.field import Window
 from weather_aug.render import patches, puffs
@@ -21,9 +22,12 @@ from weather_aug.render.froxels import (
     SLICES,
     FogVolume,
     accumulate,
+    even_fog,
     slice_depths_m,
     volume_of,
 )
+from weather_aug.render.medium import LOWEST_HEIGHTS
+from weather_aug.weather import Weather
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -70,6 +74,34 @@ class _View(NamedTuple):
     """Size of a node as a tangent."""
 
 
+def fog_volume_of(
+    weather: Weather, camera: Camera, window: Window, seed: int, air: Air, axes_world: Float64
+) -> FogVolume:
+    """`fog_volume` of a weather's fog, carried along by the air; `even_fog` where it is even.
+
+    Args:
+        weather: Its fog, patches and puffs.
+        camera: Of the whole picture.
+        window: (top, left, height, width).
+        seed: Which patches and puffs.
+        air: How far it has drifted since time 0.
+        axes_world: (3, 3), rows along the street, to the left, up.
+    """
+    if weather.fog_patchiness == weather.fog_puffs == 0.0:
+        return even_fog()
+    return fog_volume(
+        camera,
+        window,
+        fog_per_m=weather.fog_per_m,
+        scale_height_m=weather.fog_scale_height_m,
+        patchiness=weather.fog_patchiness,
+        puff_share=weather.fog_puffs,
+        seed=seed,
+        axes_world=axes_world,
+        drift_world_m=np.asarray(air.drift_m) @ axes_world,
+    )
+
+
 def fog_volume(
     camera: Camera,
     window: Window,
@@ -81,8 +113,8 @@ def fog_volume(
     seed: int,
     axes_world: Float64,
     drift_world_m: Float64,
-) -> FogVolume | None:
-    """Shares of the fog's optical depth over a window of a picture, or None where fog is even.
+) -> FogVolume:
+    """Shares of the fog's optical depth over a window of a picture; `even_fog` where it is even.
 
     Patches multiply the extinction by exp(kappa n - kappa^2 / 2), kappa = `patchiness`, n fractal
     noise of unit variance; puffs are Gaussians that carry the share `puff_share` in front of their
@@ -110,7 +142,7 @@ def fog_volume(
     puff_share = finite("puff_share", puff_share, 0, 0.5)
     seed = check_seed("seed", seed)
     if fog_per_m == 0 or (kappa == 0 and puff_share == 0):
-        return None
+        return even_fog()
     node_px = max(LEAST_NODE_PX, max(camera.width, camera.height) / NODES_ACROSS)
     rows, columns = _nodes(window, node_px)
     view = _view(camera, rows, columns, node_px, scale_height_m, axes_world, drift_world_m)
@@ -307,8 +339,8 @@ def _add_puffs(
     # A Gaussian in exponential air: the mean over all puffs at a height is the air's own density
     # there only if each is thinned by the second term, too.
     thinning = found[:, 4] / scale_height_m + 0.5 * (sigma_m / scale_height_m) ** 2
-    # Below eight scale heights the even fog thickens no more, either.
-    alive = (drawn > 0) & (found[:, 2] > -puffs.CUT * sigma_m) & (thinning > -8.0)
+    # Farther below, the even fog thickens no more, either.
+    alive = (drawn > 0) & (found[:, 2] > -puffs.CUT * sigma_m) & (thinning > LOWEST_HEIGHTS)
     index, thinning, drawn = index[alive], thinning[alive], drawn[alive]
     puffs.add_puffs(
         found[alive],
@@ -327,7 +359,10 @@ def _puffs(view: _View, classes: _PuffClasses, seed: int) -> Float64:
     sigma_m = classes.sigma_m
     cell_m = 4.0 * sigma_m
     bounds_m = np.empty((len(sigma_m), 2, 3))
-    for k, (reach_m, pad_m) in enumerate(zip(classes.reach_m, puffs.CUT * sigma_m, strict=True)):
+    # Beside a slanted ray a puff reaches farther along the axes than its own size.
+    slant = np.sqrt(1.0 + np.abs(view.ray_x).max() ** 2 + np.abs(view.ray_y).max() ** 2)
+    pads_m = puffs.CUT * sigma_m * slant
+    for k, (reach_m, pad_m) in enumerate(zip(classes.reach_m, pads_m, strict=True)):
         corners = np.array(list(_corners(view, reach_m))) @ view.axes_from_camera.T
         bounds_m[k] = corners.min(axis=0) - pad_m, corners.max(axis=0) + pad_m
     keys = np.array([key_of("fog-puffs", seed, k) % 2**64 for k in range(len(sigma_m))], np.uint64)

@@ -138,42 +138,6 @@ def share_row(volume, y, left, depth, nodes, place, out):
 
 
 @compiled
-def share_at(volume, x_px, y_px, z):
-    """Share G at depth z of the pixel (x_px, y_px) of the whole picture, for a single particle.
-
-    A place outside the volume's nodes takes the value at their edge.
-    """
-    share = volume.share
-    slices, rows, columns = share.shape
-    one = np.float32(1.0)
-    fy = np.float32(y_px) * volume.nodes_per_px - np.float32(volume.first_row)
-    fx = np.float32(x_px) * volume.nodes_per_px - np.float32(volume.first_column)
-    fy = min(max(fy, np.float32(0.0)), np.float32(rows - 1))
-    fx = min(max(fx, np.float32(0.0)), np.float32(columns - 1))
-    r, c = min(np.int64(fy), rows - 2), min(np.int64(fx), columns - 2)
-    wy, wx = fy - np.float32(r), fx - np.float32(c)
-    inverse = one / z
-    if z < np.float32(Z_FAR_M):
-        position = np.sqrt(np.float32(16.0) + np.float32(8.0) * z) - np.float32(4.0)
-    else:
-        position = np.float32(NEAR_SLICES) + np.float32(FAR_SLICES) * (
-            one - np.float32(Z_FAR_M) * inverse
-        )
-    k = min(np.int64(position), slices - 2)
-    v = (volume.inverse_depth[k] - inverse) * volume.per_step[k]
-    v = min(max(v, np.float32(0.0)), one)
-    here = _across(share[k], r, c, wy, wx)
-    return here + v * (_across(share[k + 1], r, c, wy, wx) - here)
-
-
-@compiled
-def _across(plane, r, c, wy, wx):
-    a = plane[r, c] + wy * (plane[r + 1, c] - plane[r, c])
-    b = plane[r, c + 1] + wy * (plane[r + 1, c + 1] - plane[r, c + 1])
-    return a + wx * (b - a)
-
-
-@compiled
 def even_layer(z, per_height):
     """Optical depth of even fog to depth z, in units of its extinction at the camera (metres).
 
@@ -182,7 +146,7 @@ def even_layer(z, per_height):
         per_height: Rise of the ray per metre of depth over the scale height, 1/m.
     """
     heights = z * per_height if per_height != 0.0 else 0.0
-    # Below eight scale heights under the camera `medium.path_optical_depth` thickens no more.
+    # Below eight scale heights under the camera `medium.layer_share` thickens no more.
     if heights < -8.0:
         return z * (np.expm1(8.0) / 8.0)
     if np.abs(heights) < 1e-6:

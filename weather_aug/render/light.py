@@ -174,3 +174,8 @@ def snow_colour(ambience: Ambience) -> Float64:
     """Linear colour of a flake: diffuse, lit from above and below, never brighter than the sky."""
     diffuse = 0.9 * 0.5 * (ambience.sky + ambience.ground)
     return np.minimum(diffuse, 0.98 * ambience.sky)
+
+
+def particle_colour(kind: str, light: Ambience) -> Float64:
+    """Linear colour (3,) of a kind of particle ("rain" or "snow") under a light."""
+    return {"rain": rain_colour, "snow": snow_colour}[kind](light)

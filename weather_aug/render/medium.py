@@ -15,6 +15,16 @@ from weather_aug.render.froxels import share_row
 
 FAR_DEPTH_M = 60000.0
 """float16 ends here; a greater depth is the sky or beyond measure."""
+LAYER_M = 1000.0
+"""Height of the layer of weather: a ray to the sky ends at its top."""
+LONGEST_M = 20_000.0
+FLATTEST_SINE = 0.05
+THICKEST = 60.0
+"""Optical depth beyond which no light is left in any number format."""
+LOWEST_HEIGHTS = -8.0
+"""Scale heights from the camera below which fog thickens no more."""
+SPRAY_HEIGHT_M = 0.5
+"""Height over which spray thins by a factor e."""
 
 
 class Optics(NamedTuple):
@@ -52,10 +62,6 @@ class Medium(NamedTuple):
     """Height of the camera over the road, in scale heights of the spray."""
 
 
-SPRAY_HEIGHT_M = 0.5
-"""Height over which spray thins by a factor e."""
-
-
 @compiled
 def survival(optical_depth):
     """exp(-x) for x in [-16, 80] to 2e-5, in operations that give equal bits on every machine."""
@@ -88,7 +94,7 @@ def _mean_of_thin_layer(heights):
 def layer_share(heights):
     """Mean of exp(-h) along a ray that climbs by h scale heights, (1 - exp(-h)) / h."""
     one = np.float32(1.0)
-    lowest, highest, thin = np.float32(-8.0), np.float32(80.0), np.float32(0.05)
+    lowest, highest, thin = np.float32(LOWEST_HEIGHTS), np.float32(80.0), np.float32(0.05)
     h = heights if heights > lowest else lowest
     away = h if abs(h) >= thin else thin
     share = (one - survival(away if away < highest else highest)) / away
@@ -143,7 +149,7 @@ def near_optical_depth(z, ray_x, ray_y, optics, medium, carried):
     rest = rest if rest > zero else zero
     tau = medium.fog_per_m * fog + medium.spray_per_m * spray + medium.haze_per_m
     tau = (tau * z + rest) * norm
-    most = np.float32(60.0)
+    most = np.float32(THICKEST)
     return tau if tau < most else most
 
 
@@ -151,8 +157,8 @@ def near_optical_depth(z, ray_x, ray_y, optics, medium, carried):
 def reach_row(depth, ray_x, ray_y, optics, slant, reach):
     """Length of a ray per metre of depth, and the depth at which each pixel's air ends."""
     one = np.float32(1.0)
-    far, nearly_flat = np.float32(FAR_DEPTH_M), np.float32(0.05)
-    layer_m, longest_m = np.float32(1000.0), np.float32(20000.0)
+    far, nearly_flat = np.float32(FAR_DEPTH_M), np.float32(FLATTEST_SINE)
+    layer_m, longest_m = np.float32(LAYER_M), np.float32(LONGEST_M)
     across = one + ray_y * ray_y
     rise_y = optics.up_y * ray_y + optics.up_z
     # Counted, because a largest value of floats would not be found in vectors.
@@ -219,7 +225,7 @@ def transmittance_row(
         for x in range(width):
             rest = medium.precipitation_per_m * out[x] - carried[x]
             tau[x] += (rest if rest > zero else zero) * slant[x]
-    most = np.float32(60.0)
+    most = np.float32(THICKEST)
     for x in range(width):
         tau[x] = tau[x] if tau[x] < most else most
         out[x] = survival(tau[x])

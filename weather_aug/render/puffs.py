@@ -20,33 +20,6 @@ CUT = 3.0
 
 
 @compiled
-def line_optical_depth(peak_per_m, sigma_m, centre_m, ray, z0, z1):
-    """Optical depth of one isotropic Gaussian puff between two depths of a ray, float64.
-
-    Args:
-        peak_per_m: Extinction in its middle, 1/m.
-        sigma_m: Standard deviation.
-        centre_m: (3,) relative to the ray's origin.
-        ray: (3,) direction per unit of depth, not of unit length.
-        z0: First depth.
-        z1: Last depth.
-
-    Source:
-        The integral of exp(-(a t^2 + 2 b t + c) / 2) with a = d.d / sigma^2, b = -d.mu / sigma^2,
-        c = mu.mu / sigma^2, in closed form.
-    """
-    variance = sigma_m * sigma_m
-    squared = ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2]
-    along = ray[0] * centre_m[0] + ray[1] * centre_m[1] + ray[2] * centre_m[2]
-    away = centre_m[0] * centre_m[0] + centre_m[1] * centre_m[1] + centre_m[2] * centre_m[2]
-    a, b, c = squared / variance, -along / variance, away / variance
-    root = math.sqrt(2.0 * a)
-    ends = math.erf((a * z1 + b) / root) - math.erf((a * z0 + b) / root)
-    off_axis = math.exp(-0.5 * (c - b * b / a))
-    return peak_per_m * math.sqrt(squared) * off_axis * math.sqrt(math.pi / (2.0 * a)) * ends
-
-
-@compiled
 def gather(keys, sigma_m, mean_per_cell, cell_m, origin_m, axes, bounds_m, out):
     """Enumerate the puffs whose centres lie in boxes around the camera.
 

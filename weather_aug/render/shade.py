@@ -12,7 +12,7 @@ import numpy as np
 from weather_aug._compiled import compiled
 from weather_aug.render.froxels import share_row
 from weather_aug.render.medium import reach_row, transmittance_row
-from weather_aug.render.project import BAND_ROWS
+from weather_aug.render.project import BAND_ROWS, LARGE
 from weather_aug.render.surface import depth_row, light_row, sky_row
 from weather_aug.render.tile import TILE_FLOATS, blend_band, cover_splat
 
@@ -138,7 +138,7 @@ def shade(
         mine = splats[band_starts[band] : band_starts[band + 1]]
         blend_band(mine, window, y0, planes, tiles)
         for i in range(mine.shape[0]):
-            if mine[i, 11] > np.float32(0.0):
+            if mine[i, LARGE] > np.float32(0.0):
                 cover_splat(mine[i], (y0, y1), window, planes, covered)
         for y in range(y0, y1):
             k = y - y0

@@ -17,8 +17,14 @@ from weather_aug.edit.physical.overcast import ZENITH_GAIN, tone
 from weather_aug.particles.field import ParticleField, Window
 from weather_aug.particles.resolve import DEPTH_BINS, FAR_M, shutter_turning_rad_per_s
 from weather_aug.particles.shelter import Shelter
-from weather_aug.render.fields import RigMotion, published_grey, published_splats, splats_of
-from weather_aug.render.fog import fog_volume
+from weather_aug.render.fields import (
+    RigMotion,
+    published_grey,
+    published_splats,
+    resolved_of,
+    splats_of,
+)
+from weather_aug.render.fog import fog_volume_of
 from weather_aug.render.froxels import FogVolume, even_fog
 from weather_aug.render.label import (
     HAZY_TRANSMITTANCE,
@@ -102,11 +108,7 @@ class Stage:
     ) -> Planes:
         """The window with the weather's sky, medium and particles."""
         weather = self.weather
-        budget = self.options.max_particles // max(len(fields), 1)
-        resolved = [field.resolve(self.camera, budget) for field in fields]
-        carried = np.zeros(DEPTH_BINS + 1, np.float32)
-        for part in resolved:
-            carried = carried + part.optical_depth
+        resolved, carried = resolved_of(fields, self.camera, self.options.max_particles)
         medium = medium_of(weather, fields, self.ambience)
         air = _Air(medium, carried, self._patches())
         splats = splats_of(
@@ -152,21 +154,8 @@ class Stage:
         return optics_of(self.camera, self.ambience.axes_world[2])
 
     def _patches(self) -> FogVolume:
-        weather, axes = self.weather, self.ambience.axes_world
-        if weather.fog_patchiness == weather.fog_puffs == 0.0:
-            return even_fog()
-        volume = fog_volume(
-            self.camera,
-            self.window,
-            fog_per_m=weather.fog_per_m,
-            scale_height_m=weather.fog_scale_height_m,
-            patchiness=weather.fog_patchiness,
-            puff_share=weather.fog_puffs,
-            seed=self.seed,
-            axes_world=axes,
-            drift_world_m=np.asarray(self.air.drift_m) @ axes,
-        )
-        return even_fog() if volume is None else volume
+        axes = self.ambience.axes_world
+        return fog_volume_of(self.weather, self.camera, self.window, self.seed, self.air, axes)
 
     @property
     def _look(self) -> _Look:

@@ -13,10 +13,25 @@ from __future__ import annotations
 import numpy as np
 
 from weather_aug._compiled import compiled, inlined
+from weather_aug.render.project import (
+    CONIC,
+    DEPTH,
+    HALF_HEIGHT,
+    HALF_WIDTH,
+    HIDING_ALPHA,
+    LEAN,
+    LIGHT,
+    PEAK,
+    REACH2,
+    U,
+    V,
+)
 
 PLANES = 5
 """Red, green, blue, transmittance, depth."""
 TILE_FLOATS = 16 * PLANES
+NEAR_EDGE_M = 0.1
+"""A particle fades out from this far in front of a surface to as far behind it."""
 
 
 @compiled
@@ -40,10 +55,11 @@ def blend_band(splats, window, band_top, planes, tiles):
             _load(tiles[i, j], planes, 4 * i, 4 * j)
     for m in range(splats.shape[0]):
         s = splats[m]
-        u, v = s[0] - np.float32(left), s[1] - np.float32(top + band_top)
-        shape = (s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7])
-        colour = (s[8], s[9], s[10])
-        half_v, half_u, lean = s[12], s[13], s[14]
+        u, v = s[U] - np.float32(left), s[V] - np.float32(top + band_top)
+        conic = (s[CONIC], s[CONIC + 1], s[CONIC + 2])
+        shape = (s[U], s[V], *conic, s[REACH2], s[PEAK], s[DEPTH])
+        colour = (s[LIGHT], s[LIGHT + 1], s[LIGHT + 2])
+        half_v, half_u, lean = s[HALF_HEIGHT], s[HALF_WIDTH], s[LEAN]
         first = max(int(np.floor(v - half_v)), 0) >> 2
         last = min(int(np.ceil(v + half_v)), rows - 1) >> 2
         half_u += abs(lean) * np.float32(1.5)
@@ -97,7 +113,7 @@ def _alpha(dx, dy, ahead, a, b, c, reach2, peak):
     fall = fall * fall
     fall = fall * fall
     fall = fall * fall
-    before = np.float32(0.5) + np.float32(5.0) * ahead
+    before = np.float32(0.5) + np.float32(0.5 / NEAR_EDGE_M) * ahead
     before = before if before > zero else zero
     before = before if before < one else one
     alpha = peak * fall * before
@@ -127,15 +143,16 @@ def cover_splat(splat, rows, window, planes, covered):
     `planes` starts at row rows[0] of the window; rows [rows[0], rows[1]) are looked at.
     """
     top, left, _, width = window
-    u, v, half_v = splat[0] - np.float32(left), splat[1] - np.float32(top), splat[12]
-    half_u = half_v * abs(splat[14]) + splat[13]
+    u, v, half_v = splat[U] - np.float32(left), splat[V] - np.float32(top), splat[HALF_HEIGHT]
+    half_u = half_v * abs(splat[LEAN]) + splat[HALF_WIDTH]
     first = max(int(np.floor(v - half_v)), rows[0])
     last = min(int(np.ceil(v + half_v)), rows[1] - 1)
     start = max(int(np.floor(u - half_u)), 0)
     stop = min(int(np.ceil(u + half_u)), width - 1)
     for y in range(first, last + 1):
         for x in range(start, stop + 1):
-            dx, dy = np.float32(x + left) - splat[0], np.float32(y + top) - splat[1]
-            ahead = planes[y - rows[0], 4, x] - splat[7]
-            if _alpha(dx, dy, ahead, splat[2], splat[3], splat[4], splat[5], splat[6]) > 0.5:
+            dx, dy = np.float32(x + left) - splat[U], np.float32(y + top) - splat[V]
+            ahead = planes[y - rows[0], 4, x] - splat[DEPTH]
+            a, b, c = splat[CONIC], splat[CONIC + 1], splat[CONIC + 2]
+            if _alpha(dx, dy, ahead, a, b, c, splat[REACH2], splat[PEAK]) > HIDING_ALPHA:
                 covered[y, x] = 1

@@ -175,6 +175,7 @@ def item_digests(loader: DataLoader[Any]) -> list[str]:
 
 
 @forks
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
 @pytest.mark.parametrize(
     ("workers", "method"),
     # tests/transforms has those of fork and spawn.

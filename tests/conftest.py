@@ -7,10 +7,12 @@ import os
 # Read at the import of albumentations, which else asks the network for a newer version.
 os.environ.setdefault("NO_ALBUMENTATIONS_UPDATE", "1")
 
+import numpy as np
 import pytest
 from hypothesis import settings
 from tiny_clip import TinyClip
 
+from weather_aug.render.light import Ambience
 from weather_aug.scene.scene import WeatherScene
 
 # Time limits for single examples fail on a busy machine, not on a fault.
@@ -34,3 +36,14 @@ def unlabelled_scene(tmp_path_factory: pytest.TempPathFactory) -> WeatherScene:
     """The same street where nobody labelled it."""
     folder = tmp_path_factory.mktemp("unlabelled") / "scene"
     return WeatherScene.build(TinyClip(name="unlabelled", labelled=False), folder)
+
+
+@pytest.fixture
+def ambience() -> Ambience:
+    return Ambience(
+        np.eye(3),
+        sky=np.array([0.6, 0.65, 0.7]),
+        middle=np.full(3, 0.2),
+        ground=np.full(3, 0.12),
+        airlight=np.array([0.55, 0.56, 0.57]),
+    )

@@ -15,6 +15,8 @@ from weather_aug.particles import statistics
 from weather_aug.particles.resolve import FAR_M
 from weather_aug.render import fields, stage
 from weather_aug.render.compose import render
+from weather_aug.render.froxels import even_fog
+from weather_aug.render.medium import Medium, optical_depth
 from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
 
@@ -86,15 +88,22 @@ def test_1_opacity_that_grows_with_depth_is_found_out():
         check_beer_lambert(faults.opacity_of_the_papers_fog, 1.0, 0.2)
 
 
-def at(resolved, depth_m):
-    """The veil's table, between its entries."""
+def drawn_at(resolved, depth_m):
+    """What drawn particles carry on the axis up to a depth."""
     depths = np.linspace(0, FAR_M, len(resolved.optical_depth))
     return np.interp(depth_m, depths, resolved.optical_depth)
 
 
 def veil(population, resolved, depth_m):
-    """Optical depth of what is not drawn, as the medium computes it."""
-    return population.extinction_per_m * depth_m - at(resolved, depth_m)
+    """Optical depth that the medium's kernel adds on the axis for what is not drawn."""
+    air = Medium(*(np.float32(0.0),) * 7)._replace(
+        precipitation_per_m=np.float32(population.extinction_per_m),
+        resolved_step_m=np.float32(FAR_M / (len(resolved.optical_depth) - 1)),
+    )
+    axis = stage.optics_of(make_camera(1, 1, 100.0), np.array([0.0, 0, 1]))
+    depth = np.array([[depth_m]], np.float32)
+    carried = np.array(resolved.optical_depth)
+    return float(optical_depth(depth, (0, 0, 1, 1), axis, air, carried, even_fog())[0, 0])
 
 
 def check_explicit_and_residual(kind, budget, exposure_s=0.002, *, veil=veil, fade=size_laws.fade):
@@ -150,7 +159,7 @@ def check_rendered_walls(ambience, depth_m, budgets, seeds):
     expected = np.exp(-2.451e-3 * 4.0 * depth_m * slant).mean()
     snow = field(statistics.snow(4.0))
     for budget in budgets:
-        assert at(snow.resolve(cam, budget), depth_m) > 0.05 * 9.8e-3 * depth_m
+        assert drawn_at(snow.resolve(cam, budget), depth_m) > 0.05 * 9.8e-3 * depth_m
         shots = [
             render(
                 frame,

@@ -117,7 +117,7 @@ class ParticleField:
         sway_m_per_s = sway_m * population.sway_rad_per_s
         reach_m = np.array(resolved.reach_m)
         speed = np.linalg.norm(relative, axis=1) + sway_m_per_s.sum(axis=1)
-        tangents, steepest = _tangents(camera, window), _steepest(camera)
+        tangents, steepest = padded_tangents(camera, window), _steepest(camera)
         pad_m = _pad_m(camera, steepest, reach_m, speed, population)
         near_m = resolved.near_m
         fade_per_m = (1.0 / (FADE_SHARE * np.maximum(reach_m, near_m))).astype(np.float32)
@@ -217,7 +217,7 @@ def _counts(mean_per_cell: tuple[float, ...]) -> NDArray[np.uint64]:
     return counts
 
 
-def _tangents(camera: Camera, window: Window) -> Float64:
+def padded_tangents(camera: Camera, window: Window) -> Float64:
     """Tangents (x0, x1, y0, y1) of a window's view, with the reach of the pixel filter."""
     (fx, fy), (cx, cy) = camera.focal_px, camera.principal_px
     top, left, height, width = window
@@ -236,7 +236,7 @@ def _steepest(camera: Camera) -> Float64:
 
     Of the whole picture and not of a window, lest a window draws other particles than the whole.
     """
-    whole = np.abs(_tangents(camera, (0, 0, camera.height, camera.width)))
+    whole = np.abs(padded_tangents(camera, (0, 0, camera.height, camera.width)))
     return whole.reshape(2, 2).max(axis=1) + BEYOND_PICTURE
 
 

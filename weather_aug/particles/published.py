@@ -36,7 +36,7 @@ from weather_aug._keys import check_seed, key_of
 from weather_aug.clip.types import Camera
 from weather_aug.errors import ArgumentError
 from weather_aug.particles import published_kernels as kernels
-from weather_aug.particles.field import BLUR_PX, Window
+from weather_aug.particles.field import Window, padded_tangents
 from weather_aug.particles.published_presets import BOX_AXES, PublishedPreset
 from weather_aug.particles.resolve import NEAR_M
 
@@ -146,8 +146,8 @@ class PublishedField:
         largest[1] *= max(preset.y_multipliers)
         return kernels.View(
             np.ascontiguousarray(camera_from_box[:3]),
-            _tangents(camera, (0, 0, camera.height, camera.width)),
-            _tangents(camera, window),
+            padded_tangents(camera, (0, 0, camera.height, camera.width)),
+            padded_tangents(camera, window),
             NEAR_M,
             float(REACH_SIGMAS * largest.max()),
         )
@@ -161,20 +161,6 @@ def field_from_world(world_from_first: Float64, world_from_now: Float64) -> Floa
         world_from_now: (4, 4) its pose at this moment. The cameras of one rig share it.
     """
     return world_from_first @ np.linalg.inv(world_from_now)
-
-
-def _tangents(camera: Camera, window: Window) -> Float64:
-    """(x0, x1, y0, y1) of a window, padded by the reach of the pixel filter."""
-    (fx, fy), (cx, cy) = camera.focal_px, camera.principal_px
-    top, left, height, width = window
-    return np.array(
-        [
-            (left - BLUR_PX - cx) / fx,
-            (left + width + BLUR_PX - cx) / fx,
-            (top - BLUR_PX - cy) / fy,
-            (top + height + BLUR_PX - cy) / fy,
-        ]
-    )
 
 
 def _attributes(preset: PublishedPreset) -> kernels.Attributes:

@@ -12,7 +12,7 @@ from weather_aug.air import Air
 from weather_aug.clip.types import Camera
 from weather_aug.particles import statistics
 from weather_aug.particles.field import ParticleField, Window
-from weather_aug.particles.published import PublishedField
+from weather_aug.particles.published import PublishedField, field_from_world
 from weather_aug.particles.published_presets import published_preset
 from weather_aug.particles.resolve import DEPTH_BINS, Resolved
 from weather_aug.particles.shelter import Shelter, exposed
@@ -39,7 +39,7 @@ class RigMotion:
     @property
     def field_from_world(self) -> Float64:
         """(4, 4) inverse of the paper's Delta T = T_t T_0^-1."""
-        return np.asarray(self.world_from_first @ np.linalg.inv(self.world_from_now))
+        return field_from_world(self.world_from_first, self.world_from_now)
 
 
 def falling(weather: Weather, rain_fall_speed: str = "brandes") -> list[statistics.Population]:
@@ -61,8 +61,9 @@ def fields_of(
     rig: RigMotion | None,
 ) -> list[ParticleField]:
     """The particle fields of a weather at one moment."""
-    carried = options.alignment == "camera" and rig is not None
-    motion = rig.field_from_world if carried and rig is not None else None
+    motion = None
+    if rig is not None and options.alignment == "camera":
+        motion = rig.field_from_world
     return [
         ParticleField(population, seed, air, axes_world, motion)
         for population in falling(weather, options.rain_fall_speed)

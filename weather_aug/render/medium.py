@@ -6,7 +6,7 @@ picture or a window of it is rendered.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -178,24 +178,19 @@ def reach_row(depth, ray_x, ray_y, optics, slant, reach):
 
 
 @compiled
-def transmittance_row(
-    ray_x, ray_y, slant, share, optics, medium, resolved_depth, place, carried, tau, out
-):
+def transmittance_row(ray_x, ray_y, optics, medium, resolved_depth, space, out):
     """Optical depth of the air before each pixel of a row and what of the light survives it.
 
     Args:
         ray_x: (W,) tangents.
         ray_y: Tangent.
-        slant: (W,) length of a ray per metre of depth.
-        share: (W,) factor on the fog's optical depth, or (0,) for 1.
         optics: Camera.
         medium: Air.
         resolved_depth: Optical depth of resolved particles by depth.
-        place: (W,) uint32 work space.
-        carried: (W,) float32 work space.
-        tau: (W,) out: optical depth.
+        space: RowSpace with slant and share filled in.
         out: (W,) depth at which the air ends in, transmittance out.
     """
+    slant, share, _, place, carried, tau = space
     zero = np.float32(0.0)
     width = out.shape[0]
     for x in range(width):
@@ -231,35 +226,89 @@ def transmittance_row(
         out[x] = survival(tau[x])
 
 
+class RowSpace(NamedTuple):
+    """Work space of `air_row` for rows of W pixels."""
+
+    slant: Any
+    """(W,) length of a ray per metre of depth."""
+    share: Any
+    """(W,) factor on the fog's optical depth, or (0,) where the fog is even."""
+    nodes: Any
+    """For `share_row`."""
+    place: Any
+    """(W,) uint32."""
+    carried: Any
+    """(W,) float32."""
+    tau: Any
+    """(W,) optical depth of the row that was done last."""
+
+
+@compiled
+def row_space(width, patches):
+    """RowSpace for rows of `width` pixels."""
+    slices, _, columns = patches.share.shape
+    share = np.ones(width if slices > 0 else 0, np.float32)
+    nodes = np.empty(slices * columns, np.float32)
+    floats = np.empty((3, width), np.float32)
+    place = np.empty(width, np.uint32)
+    return RowSpace(floats[0], share, nodes, place, floats[1], floats[2])
+
+
+@compiled
+def rays_across(width, left, optics):
+    """Tangents (width,) of the pixel columns from column `left` of the picture."""
+    ray_x = np.empty(width, np.float32)
+    for x in range(width):
+        ray_x[x] = (np.float32(x + left) - optics.cx) / optics.fx
+    return ray_x
+
+
+@compiled
+def air_row(depth, width, y, left, ray_x, ray_y, patches, optics, medium, resolved, space, out):
+    """Optical depth (`space.tau`) and transmittance of the air before each pixel of a row.
+
+    Args:
+        depth: (W,) metres, `inf` for far.
+        width: How many of them are pixels of the picture; the rest fills up the last vector.
+        y: Row in the whole picture.
+        left: First column in the whole picture.
+        ray_x: (W,) tangents.
+        ray_y: Tangent.
+        patches: FogVolume.
+        optics: Camera.
+        medium: Air.
+        resolved: Optical depth of resolved particles by depth.
+        space: RowSpace.
+        out: (W,) out: transmittance.
+    """
+    reach_row(depth, ray_x, ray_y, optics, space.slant, out)
+    if space.share.shape[0] > 0:
+        share_row(patches, y, left, out[:width], space.nodes, space.place, space.share[:width])
+    transmittance_row(ray_x, ray_y, optics, medium, resolved, space, out)
+
+
 @compiled
 def optical_depth(depth, window, optics, medium, resolved_depth, patches):
     """Optical depth (H, W) float32 of the air in front of each pixel of a window."""
     top, left, height, width = window
-    ray_x = np.empty(width, np.float32)
-    for x in range(width):
-        ray_x[x] = (np.float32(x + left) - optics.cx) / optics.fx
-    patchy = patches.share.shape[0] > 0
-    nodes = np.empty(patches.share.shape[0] * patches.share.shape[2], np.float32)
-    place, carried = np.empty(width, np.uint32), np.empty(width, np.float32)
-    share = np.empty(width if patchy else 0, np.float32)
-    slant, reach = np.empty(width, np.float32), np.empty(width, np.float32)
+    ray_x, space = rays_across(width, left, optics), row_space(width, patches)
+    through = np.empty(width, np.float32)
     tau = np.empty((height, width), np.float32)
     for y in range(height):
         ray_y = (np.float32(y + top) - optics.cy) / optics.fy
-        reach_row(depth[y], ray_x, ray_y, optics, slant, reach)
-        if patchy:
-            share_row(patches, y + top, left, reach, nodes, place, share)
-        transmittance_row(
+        air_row(
+            depth[y],
+            width,
+            y + top,
+            left,
             ray_x,
             ray_y,
-            slant,
-            share,
+            patches,
             optics,
             medium,
             resolved_depth,
-            place,
-            carried,
-            tau[y],
-            reach,
+            space,
+            through,
         )
+        tau[y] = space.tau
     return tau

@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from weather_aug._compiled import compiled
-from weather_aug.render.froxels import share_row
-from weather_aug.render.medium import reach_row, transmittance_row
+from weather_aug.render.medium import air_row, rays_across, row_space
 from weather_aug.render.project import BAND_ROWS, LARGE
 from weather_aug.render.surface import depth_row, light_row, sky_row
 from weather_aug.render.tile import TILE_FLOATS, blend_band, cover_splat
@@ -80,24 +79,16 @@ def shade(
     least_contrast, hazy = limits
     # Rows of whole vectors: the few pixels that would be left over cost as much as hundreds.
     wide = (width + 15) // 16 * 16
-    ray_x = np.empty(wide, np.float32)
-    for x in range(wide):
-        ray_x[x] = (np.float32(x + left) - optics.cx) / optics.fx
+    ray_x, space = rays_across(wide, left, optics), row_space(wide, patches)
     # Red, green, blue, transmittance and depth of a band's rows side by side. The odd stride keeps
     # them apart in the cache: planes of equal page offset would evict each other at every pixel.
     stride = wide + 80
     planes = np.ones((BAND_ROWS, 5, stride), np.float32)
     bits = planes.view(np.int32)
     tiles = np.empty((BAND_ROWS // 4, stride // 4, TILE_FLOATS), np.float32)
-    patchy = patches.share.shape[0] > 0
-    nodes = np.empty(patches.share.shape[0] * patches.share.shape[2], np.float32)
-    place, carried = np.empty(wide, np.uint32), np.empty(wide, np.float32)
-    share = np.ones(wide if patchy else 0, np.float32)
     gap = np.empty((BAND_ROWS, wide), np.float32)
     sky = np.zeros((BAND_ROWS, wide), np.uint8)
     shown = np.zeros(wide, np.uint8)
-    tau = np.empty(wide, np.float32)
-    slant = np.empty(wide, np.float32)
     overcast = tone.overcast > np.float32(0.0)
     hidden = 0
     for band in range(band_starts.shape[0] - 1):
@@ -110,20 +101,18 @@ def shade(
             clear, depth = planes[k, 3, :wide], planes[k, 4, :wide]
             depth_row(surface, y + top, left, bits[k, 4, :width], depth[:width])
             sky_row(surface, y + top, left, depth[:width], sky[k, :width])
-            reach_row(depth, ray_x, ray_y, optics, slant, clear)
-            if patchy:
-                share_row(patches, y + top, left, clear[:width], nodes, place, share[:width])
-            transmittance_row(
+            air_row(
+                depth,
+                width,
+                y + top,
+                left,
                 ray_x,
                 ray_y,
-                slant,
-                share,
+                patches,
                 optics,
                 medium,
                 resolved_depth,
-                place,
-                carried,
-                tau,
+                space,
                 clear,
             )
             light_row(surface, y + top, left, linear, red[:width], green[:width], blue[:width])

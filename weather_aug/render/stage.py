@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import cv2
@@ -77,10 +78,9 @@ class _Look(NamedTuple):
     matrix: Float64
     """(3, 3) of colours after it."""
     overcast: float
-    encoded: float
-    """1 where colours stay in sRGB."""
     veil: float | None = None
-    """Grey in sRGB that hides surfaces, where colours stay in sRGB; else the airlight does."""
+    """Grey in sRGB that hides surfaces: colours then stay in sRGB. Else it is the airlight, and
+    light is linear."""
 
     def contrast(self, airlight: Float64) -> tuple[Float64, float]:
         """Colour (3,) that hides surfaces, and the least difference from it that can be seen."""
@@ -124,7 +124,7 @@ class Stage:
             shelter,
         )
         if self.options.multiple_scattering:
-            plain = _Look(SRGB_LEVELS_LINEAR, np.eye(3), 0.0, 0.0)
+            plain = _Look(SRGB_LEVELS_LINEAR, np.eye(3), 0.0)
             return self._run(self._scattered(air), air, plain, splats)
         return self._run(self.surface, air, self._look, splats)
 
@@ -146,10 +146,10 @@ class Stage:
         )
         # What hides a surface here is the release's grey, and colours differ in sRGB.
         grey = published_grey(self.weather, self.options)
-        encoded = _Look(np.arange(256) / 255, np.eye(3), 0.0, 1.0, grey)
+        encoded = _Look(np.arange(256) / 255, np.eye(3), 0.0, grey)
         return self._run(self._background(), self._clear_air, encoded, splats)
 
-    @property
+    @cached_property
     def _optics(self) -> Optics:
         return optics_of(self.camera, self.ambience.axes_world[2])
 
@@ -160,7 +160,7 @@ class Stage:
     @property
     def _look(self) -> _Look:
         """How recorded colours change under the weather's sky."""
-        return _Look(*tone(self.weather.overcast), self.weather.overcast, 0.0)
+        return _Look(*tone(self.weather.overcast), self.weather.overcast)
 
     @property
     def _clear_air(self) -> _Air:
@@ -186,7 +186,7 @@ class Stage:
         _, _, height, width = self.window
         splats, band_starts = split_by_band(splats, self.window, -(-height // BAND_ROWS))
         sky_luminance = max(float(self.ambience.sky @ LUMINANCE), 0.05)
-        sky = (look.overcast, sky_luminance, ZENITH_GAIN, look.encoded)
+        sky = (look.overcast, sky_luminance, ZENITH_GAIN, look.veil is not None)
         veil, contrast = look.contrast(self.ambience.airlight)
         limits = (contrast, HAZY_TRANSMITTANCE)
         levels = np.empty((3, height, (width + 15) // 16 * 16), np.uint8)

@@ -17,9 +17,9 @@ from benchmarks.overlays import CASES, HEIGHT, WIDTH
 from benchmarks.scene import street
 from benchmarks.timing import interleaved
 from weather_aug.clip.types import Frame
+from weather_aug.edit.ambience import Ambience
 from weather_aug.render.batch import RenderedBatch, render_batch
 from weather_aug.render.compose import render
-from weather_aug.render.light import Ambience
 from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
 

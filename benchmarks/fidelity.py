@@ -14,10 +14,11 @@ from benchmarks.report import Row, show
 from benchmarks.scene import AXES, street
 from weather_aug.air import air_of
 from weather_aug.clip.types import Frame
+from weather_aug.edit.ambience import Ambience
 from weather_aug.particles.resolve import DEPTH_BINS, FAR_M
 from weather_aug.render.compose import render
 from weather_aug.render.fields import fields_of
-from weather_aug.render.light import Ambience, particle_colour
+from weather_aug.render.light import particle_colour
 from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
 

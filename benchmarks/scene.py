@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug.clip.types import Camera, Frame, FrameKey
-from weather_aug.render.light import Ambience, ambience_of
+from weather_aug.edit.ambience import Ambience, ambience_of
 from weather_aug.taxonomy import BUILDING, ROAD, SKY
 
 AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

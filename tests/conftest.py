@@ -12,7 +12,7 @@ import pytest
 from hypothesis import settings
 from tiny_clip import TinyClip
 
-from weather_aug.render.light import Ambience
+from weather_aug.edit.ambience import Ambience
 from weather_aug.scene.scene import WeatherScene
 
 # Time limits for single examples fail on a busy machine, not on a fault.

@@ -235,10 +235,10 @@ def test_a_constant_changed_in_another_module_changes_the_result(tmp_path: Path)
     package = copied_package(tmp_path)
     assert ran(tmp_path, "-c", PROBE).split() == ["50000.0", "0"]
     assert ran(tmp_path, "-c", PROBE).split() == ["50000.0", "1"]
-    medium = package / "render" / "medium.py"
-    source = medium.read_text(encoding="utf-8")
+    types = package / "clip" / "types.py"
+    source = types.read_text(encoding="utf-8")
     assert "FAR_DEPTH_M = 60000.0" in source
-    medium.write_text(source.replace("FAR_DEPTH_M = 60000.0", "FAR_DEPTH_M = 40000.0"))
+    types.write_text(source.replace("FAR_DEPTH_M = 60000.0", "FAR_DEPTH_M = 40000.0"))
     assert ran(tmp_path, "-c", PROBE).split() == ["inf", "0"]
 
 

@@ -14,16 +14,15 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from weather_aug.errors import ArgumentError
-from weather_aug.weather import (
+from weather_aug.severity import (
     NAMED_SEVERITIES,
-    Weather,
     fog_severity,
     parse_severity,
     rain_severity,
-    shape_ends,
     snow_severity,
     visibility_from_severity,
 )
+from weather_aug.weather import Weather, shape_ends
 
 GRID = [i / 100 for i in range(101)]
 STOPS = [0.25, 0.5, 0.75, 1.0]

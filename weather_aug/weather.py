@@ -7,13 +7,10 @@ import math
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
+from weather_aug import severity as stops
 from weather_aug._checks import finite, real
 from weather_aug.errors import ArgumentError, printable
-
-CONTRAST_THRESHOLD = 0.05
-"""Contrast left at the meteorological optical range (World Meteorological Organization)."""
-
-NAMED_SEVERITIES = {"light": 0.25, "moderate": 0.5, "heavy": 0.75, "extreme": 1.0}
+from weather_aug.severity import CONTRAST_THRESHOLD, severity_from
 
 Wind = tuple[float, float, float]
 
@@ -29,19 +26,16 @@ class Weather:
         and what lies on the ground are separate fields: a wet road without rain is a Weather, and
         so is snowfall over a clear road. Wind is given along the street, not in world axes: (along
         the clip's first heading, to its left, up). Severity s in [0, 1] names a physical state, it
-        is not part of it: light 0.25, moderate 0.5, heavy 0.75, extreme 1; between the stops all
-        quantities are log-linear in s, below light they fall to 0 with s squared (fog extinction:
-        with s), so that s = 0 is clear. A Weather is a state at one moment and knows no time: how
-        its gusts blow and how far they carry the air is `weather_aug.air`, how weather changes is
-        `WeatherTimeline`. Gustiness, snow wetness, fog patchiness and fog puffs only shape the
+        is not part of it; see `weather_aug.severity`. A Weather is a state at one moment and knows
+        no time: how its gusts blow and how far they carry the air is `weather_aug.air`, how weather
+        changes is `WeatherTimeline`. Gustiness, snow wetness, fog patchiness and puffs only shape the
         wind, snow and fog that are there; without those they mean nothing.
 
     Raises:
         ArgumentError: If a field is outside its range.
 
     Source:
-        Rates inside the classes of the American Meteorological Society and the Met Office;
-        fog stops at the three levels of Foggy Cityscapes; see docs/physics.md.
+        docs/physics.md.
     """
 
     rain_mm_per_h: float = 0.0
@@ -55,9 +49,15 @@ class Weather:
     mist_per_km: float = 0.0
     """Extinction of what comes with precipitation (mist, blowing snow), in [0, 100] per km."""
     wetness: float = 0.0
-    """Of the ground, in [0, 1]. Part of the state and of labels' recipes; not drawn yet."""
+    """Of the ground and the walls, from dry (0) to a closed film of water (1)."""
+    puddles: float = 0.0
+    """Share of the road under standing water, in [0, 1]."""
     snow_cover: float = 0.0
-    """Of the ground beside the road, in [0, 1]; not drawn yet."""
+    """Share of the ground beside the road that snow covers, in [0, 1]."""
+    road_snow_cover: float = 0.0
+    """Share of the road that snow covers, in [0, 1]."""
+    snow_depth_m: float = 0.0
+    """Of the snow on the ground, in [0, 2]; deep snow buries kerbs."""
     overcast: float = 0.0
     """From the recorded sky (0) to a closed cloud deck (1)."""
     wind_m_per_s: Wind = (0.0, 0.0, 0.0)
@@ -72,6 +72,12 @@ class Weather:
     """Share of the fog's extinction that drifting Gaussian puffs carry, in [0, 0.5]."""
     spray_per_km: float = 0.0
     """Extinction of spray at the road, in [0, 200] per km; thins with a scale height of 0.5 m."""
+    lamps: float = 0.0
+    """Share of the vehicles that drive with lamps on, in [0, 1]."""
+    lens_drops: float = 0.0
+    """Mean number of drops on the glass before a camera, in a whole picture, in [0, 500]."""
+    wipers: float = 0.0
+    """Share of the drives in which the wipers run, in [0, 1]."""
 
     def __post_init__(self) -> None:
         for name, (low, high) in _RANGES.items():
@@ -104,18 +110,10 @@ class Weather:
             falling: False for the time after: wet ground and overcast sky, nothing in the air.
             **overrides: Fields of Weather in their units.
         """
-        s = _severity(severity, "mm_per_h", mm_per_h, rain_severity)
-        state = {
-            "rain_mm_per_h": _RAIN.at(s) if mm_per_h is None else mm_per_h,
-            "mist_per_km": _RAIN_MIST.at(s),
-            "wetness": _WETNESS.at(s),
-            "overcast": _RAIN_OVERCAST.at(s),
-            "wind_m_per_s": (0.0, _RAIN_WIND.at(s), 0.0),
-            "gustiness": _RAIN_GUSTINESS.at(s),
-            "spray_per_km": _RAIN_SPRAY.at(s),
-        }
-        if not falling:
-            state |= {"rain_mm_per_h": 0.0, "mist_per_km": 0.0, "spray_per_km": 0.0}
+        s = severity_from(severity, "mm_per_h", mm_per_h, stops.rain_severity)
+        state = _state(stops.RAIN, s, stops.RAIN_WIND_M_PER_S, falling)
+        if falling and mm_per_h is not None:
+            state["rain_mm_per_h"] = mm_per_h
         return _build(cls, state, overrides)
 
     @classmethod
@@ -135,17 +133,10 @@ class Weather:
             falling: False for the time after: snow on the ground and overcast sky, clear air.
             **overrides: Fields of Weather in their units.
         """
-        s = _severity(severity, "mm_per_h", mm_per_h, snow_severity)
-        state = {
-            "snow_mm_per_h": _SNOW.at(s) if mm_per_h is None else mm_per_h,
-            "mist_per_km": _BLOWING_SNOW.at(s),
-            "snow_cover": _SNOW_COVER.at(s),
-            "overcast": _SNOW_OVERCAST.at(s),
-            "wind_m_per_s": (0.0, _SNOW_WIND.at(s), 0.0),
-            "gustiness": _SNOW_GUSTINESS.at(s),
-        }
-        if not falling:
-            state |= {"snow_mm_per_h": 0.0, "mist_per_km": 0.0}
+        s = severity_from(severity, "mm_per_h", mm_per_h, stops.snow_severity)
+        state = _state(stops.SNOW, s, stops.SNOW_WIND_M_PER_S, falling)
+        if falling and mm_per_h is not None:
+            state["snow_mm_per_h"] = mm_per_h
         return _build(cls, state, overrides)
 
     @classmethod
@@ -163,14 +154,12 @@ class Weather:
             visibility_m: Distance at which contrast falls to 5 %, metres, instead of a severity.
             **overrides: Fields of Weather in their units.
         """
-        s = _severity(severity, "visibility_m", visibility_m, fog_severity)
-        inverse_height = _fog_inverse_height(s)
-        state = {
-            "visibility_m": visibility_from_severity(s) if visibility_m is None else visibility_m,
-            "fog_scale_height_m": 1.0 / inverse_height if inverse_height else math.inf,
-            "overcast": _FOG_OVERCAST.at(s),
-            "wind_m_per_s": (0.0, _FOG_WIND.at(s), 0.0),
-        }
+        s = severity_from(severity, "visibility_m", visibility_m, stops.fog_severity)
+        state = _state(stops.FOG, s, stops.FOG_WIND_M_PER_S, True)
+        state["visibility_m"] = (
+            stops.visibility_from_severity(s) if visibility_m is None else visibility_m
+        )
+        state["fog_scale_height_m"] = stops.fog_scale_height_m(s)
         return _build(cls, state, overrides)
 
     @staticmethod
@@ -201,9 +190,8 @@ class Weather:
         windier = max(a, b, key=lambda w: (_speed(w), w.wind_m_per_s, w.gustiness))
         return replace(
             _combine(a, b, 1.0, 1.0),
-            wetness=1 - (1 - a.wetness) * (1 - b.wetness),
-            snow_cover=1 - (1 - a.snow_cover) * (1 - b.snow_cover),
-            overcast=max(a.overcast, b.overcast),
+            **{name: _either(getattr(a, name), getattr(b, name)) for name in _SHARES},
+            **{name: max(getattr(a, name), getattr(b, name)) for name in _SHARED_CAUSES},
             wind_m_per_s=windier.wind_m_per_s,
             gustiness=windier.gustiness,
             **{name: _mixed_shape(a, b, name) for name in _SHAPED_THING},
@@ -255,19 +243,25 @@ class Weather:
 
 
 _RANGES = {
-    "rain_mm_per_h": (0.0, 400.0),
-    "snow_mm_per_h": (0.0, 50.0),
-    "visibility_m": (1.0, math.inf),
+    "rain_mm_per_h": (0.0, stops.MOST_RAIN_MM_PER_H),
+    "snow_mm_per_h": (0.0, stops.MOST_SNOW_MM_PER_H),
+    "visibility_m": (stops.LEAST_VISIBILITY_M, math.inf),
     "fog_scale_height_m": (1.0, math.inf),
     "mist_per_km": (0.0, 100.0),
     "wetness": (0.0, 1.0),
+    "puddles": (0.0, 1.0),
     "snow_cover": (0.0, 1.0),
+    "road_snow_cover": (0.0, 1.0),
+    "snow_depth_m": (0.0, 2.0),
     "overcast": (0.0, 1.0),
     "gustiness": (0.0, 1.0),
     "snow_wetness": (0.0, 1.0),
     "fog_patchiness": (0.0, 1.0),
     "fog_puffs": (0.0, 0.5),
     "spray_per_km": (0.0, 200.0),
+    "lamps": (0.0, 1.0),
+    "lens_drops": (0.0, 500.0),
+    "wipers": (0.0, 1.0),
 }
 _STRONGEST_WIND_M_PER_S = 60.0
 _SHAPED_THING = {
@@ -276,75 +270,11 @@ _SHAPED_THING = {
     "fog_puffs": "fog_per_m",
 }
 """Fields that only shape something else, and what says how much of that there is."""
+_SHARES = ("wetness", "puddles", "snow_cover", "road_snow_cover")
+"""Of two weathers at once these are what either leaves, as if independent."""
+_SHARED_CAUSES = ("overcast", "snow_depth_m", "lamps", "wipers")
+"""Of these it is the larger: one sky, one reason to switch on lamps."""
 _UNSEEN_ALONE = {"wind_m_per_s", "gustiness", "fog_scale_height_m", *_SHAPED_THING}
-
-
-@dataclass(frozen=True)
-class _Stops:
-    """A quantity at light, moderate, heavy and extreme, and the power it falls with below light."""
-
-    values: tuple[float, float, float, float]
-    power_below: int = 2
-
-    def at(self, s: float) -> float:
-        if s <= 0.25:
-            return self.values[0] * (4 * s) ** self.power_below
-        lower = min(int(4 * s) - 1, 2)
-        a, b = self.values[lower], self.values[lower + 1]
-        return a * (b / a) ** (4 * s - 1 - lower)
-
-    def severity_of(self, value: float) -> float:
-        """The inverse of `at`, cut at 1; needs strictly rising stops."""
-        if value <= self.values[0]:
-            return 0.25 * (value / self.values[0]) ** (1 / self.power_below)
-        for lower in range(3):
-            a, b = self.values[lower], self.values[lower + 1]
-            if value <= b:
-                return (1 + lower + math.log(value / a) / math.log(b / a)) / 4
-        return 1.0
-
-
-_RAIN = _Stops((1.5, 5.0, 20.0, 75.0))
-_RAIN_MIST = _Stops((0.2, 0.6, 2.0, 5.0))
-_WETNESS = _Stops((0.5, 0.8, 1.0, 1.0))
-_RAIN_OVERCAST = _Stops((0.6, 0.8, 1.0, 1.0))
-_RAIN_WIND = _Stops((1.5, 3.0, 6.0, 10.0))
-_RAIN_GUSTINESS = _Stops((0.3, 0.3, 0.3, 0.3))
-_RAIN_SPRAY = _Stops((0.5, 2.0, 10.0, 25.0))
-_SNOW = _Stops((0.4, 1.0, 2.0, 4.0))
-_BLOWING_SNOW = _Stops((0.3, 0.8, 2.0, 5.0))
-_SNOW_COVER = _Stops((0.25, 0.6, 0.9, 1.0))
-_SNOW_OVERCAST = _Stops((0.6, 0.8, 1.0, 1.0))
-_SNOW_WIND = _Stops((0.5, 1.0, 2.0, 4.0))
-_SNOW_GUSTINESS = _Stops((0.25, 0.25, 0.25, 0.25))
-_FOG = _Stops((0.005, 0.01, 0.02, 0.06), power_below=1)
-_FOG_OVERCAST = _Stops((0.6, 0.8, 1.0, 1.0))
-_FOG_WIND = _Stops((0.5, 0.5, 0.5, 0.5))
-_FOG_INVERSE_HEIGHT = (0.0, 0.0, 1 / 60, 1 / 25)
-
-
-def rain_severity(mm_per_h: float) -> float:
-    """Severity in [0, 1] of a rain rate; the inverse of `Weather.rain` up to extreme."""
-    return _RAIN.severity_of(finite("mm_per_h", mm_per_h, *_RANGES["rain_mm_per_h"]))
-
-
-def snow_severity(mm_per_h: float) -> float:
-    """Severity in [0, 1] of a liquid-equivalent snow rate."""
-    return _SNOW.severity_of(finite("mm_per_h", mm_per_h, *_RANGES["snow_mm_per_h"]))
-
-
-def fog_severity(visibility_m: float) -> float:
-    """Severity in [0, 1] of a meteorological optical range in metres."""
-    visibility_m = real("visibility_m", visibility_m)
-    if visibility_m < _RANGES["visibility_m"][0]:
-        raise ArgumentError(f"visibility_m must be at least 1 m, got {visibility_m!r}")
-    return _FOG.severity_of(-math.log(CONTRAST_THRESHOLD) / visibility_m)
-
-
-def visibility_from_severity(s: float) -> float:
-    """Meteorological optical range in metres of a fog severity in [0, 1]."""
-    beta_per_m = _FOG.at(s)
-    return -math.log(CONTRAST_THRESHOLD) / beta_per_m if beta_per_m else math.inf
 
 
 def along_left_up(name: str, vector: Wind, most: float = math.inf) -> Wind:
@@ -373,39 +303,18 @@ def shape_ends(a: Weather, b: Weather, name: str) -> tuple[float, float]:
     return (start, start) if has_a else (end, end)
 
 
-def parse_severity(severity: float | str) -> float:
-    """A severity in [0, 1] from a number or one of its names.
-
-    Raises:
-        ArgumentError: If it is neither.
-    """
-    if isinstance(severity, str):
-        if severity not in NAMED_SEVERITIES:
-            raise ArgumentError(
-                f"severity {printable(severity)!r} is not one of {', '.join(NAMED_SEVERITIES)}, "
-                "nor a number in [0, 1]"
-            )
-        return NAMED_SEVERITIES[severity]
-    return finite("severity", severity, 0, 1)
+def _state(
+    table: dict[str, stops.Stops], s: float, wind_m_per_s: stops.Stops, falling: bool
+) -> dict[str, Any]:
+    """Fields of a Weather at severity `s`; without what ends when it stops falling, if so."""
+    state: dict[str, Any] = {
+        name: stop.at(s) for name, stop in table.items() if falling or name not in stops.FALLING
+    }
+    return state | {"wind_m_per_s": (0.0, wind_m_per_s.at(s), 0.0)}
 
 
-def _severity(severity: float | str | None, unit: str, value: float | None, inverse: Any) -> float:
-    if (severity is None) == (value is None):
-        raise ArgumentError(f"give either a severity or {unit}")
-    if severity is None:
-        return float(inverse(value))
-    try:
-        return parse_severity(severity)
-    except ArgumentError as error:
-        raise ArgumentError(f"{error}; for a value in its unit write {unit}=...") from None
-
-
-def _fog_inverse_height(s: float) -> float:
-    """1/m; linear between the stops, because it is 0 at the light ones."""
-    position = max(4 * s - 1, 0.0)
-    lower = min(int(position), 2)
-    a, b = _FOG_INVERSE_HEIGHT[lower], _FOG_INVERSE_HEIGHT[lower + 1]
-    return a + (b - a) * (position - lower)
+def _either(a: float, b: float) -> float:
+    return 1 - (1 - a) * (1 - b)
 
 
 def _build(cls: type[Weather], state: dict[str, Any], overrides: dict[str, Any]) -> Weather:

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from weather_aug.air import Air
 from weather_aug.clip.types import Camera, Frame, FrameKey
+from weather_aug.edit.ambience import Ambience
 from weather_aug.particles.field import ParticleField
 from weather_aug.particles.statistics import Population
 from weather_aug.render.compose import render
-from weather_aug.render.light import Ambience
 from weather_aug.render.medium import Medium
 from weather_aug.render.project import BAND_ROWS, project, sorted_in_blocks, split_by_band
 from weather_aug.render.stage import optics_of

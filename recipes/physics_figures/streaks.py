@@ -11,9 +11,9 @@ from physics_figures import scenes
 from physics_figures.style import BLUE, GREEN, ORANGE, formula, measured, panels
 from weather_aug.clip.street import StreetClip
 from weather_aug.clip.types import FrameKey
+from weather_aug.edit.ambience import ambience_of
 from weather_aug.particles import statistics
 from weather_aug.render.compose import render
-from weather_aug.render.light import ambience_of
 from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
 

@@ -7,9 +7,9 @@ import torch
 from render_scene import make_camera, make_frame
 
 from weather_aug.clip.types import Frame
+from weather_aug.edit.ambience import Ambience
 from weather_aug.render.batch import render_batch
 from weather_aug.render.compose import render
-from weather_aug.render.light import Ambience
 from weather_aug.taxonomy import BUILDING, ROAD, SKY
 from weather_aug.weather import Weather
 

@@ -10,11 +10,11 @@ from render_scene import make_camera, make_frame
 
 from weather_aug.air import Air
 from weather_aug.clip.types import Frame
+from weather_aug.edit.ambience import Ambience, airlight_from_sky, ambience_of
 from weather_aug.errors import ArgumentError
 from weather_aug.particles.kernels import scatter, solve_reach
 from weather_aug.render.compose import checked_window, render, warm_up
 from weather_aug.render.label import read_labels
-from weather_aug.render.light import Ambience, airlight_from_sky, ambience_of
 from weather_aug.render.options import RenderOptions
 from weather_aug.render.project import project, sorted_in_blocks, split_by_band
 from weather_aug.render.shade import shade

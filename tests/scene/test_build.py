@@ -18,6 +18,7 @@ from tiny_clip import TinyClip, digests_of
 
 from weather_aug import _files
 from weather_aug.clip.types import Float64, Frame, FrameKey
+from weather_aug.edit.ambience import ambience_of
 from weather_aug.errors import (
     ArgumentError,
     ClipError,
@@ -26,7 +27,6 @@ from weather_aug.errors import (
     IntegrityError,
     OutputError,
 )
-from weather_aug.render.light import ambience_of
 from weather_aug.scene import build as building
 from weather_aug.scene import store
 from weather_aug.scene.scene import WeatherScene

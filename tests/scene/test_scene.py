@@ -17,9 +17,9 @@ from tiny_clip import TinyClip
 
 from weather_aug._files import sha256_of
 from weather_aug.clip.types import FrameKey
+from weather_aug.edit.ambience import ambience_of
 from weather_aug.errors import ArgumentError, SceneError
 from weather_aug.render.compose import RenderedFrame, render
-from weather_aug.render.light import ambience_of
 from weather_aug.render.options import RenderOptions
 from weather_aug.scene import store
 from weather_aug.scene.scene import WeatherScene

@@ -18,9 +18,9 @@ from tiny_clip import digests_of
 from weather_aug import _files
 from weather_aug.clip.street import StreetClip
 from weather_aug.clip.types import Clip
+from weather_aug.edit.ambience import CAMERA_HEIGHT_M, camera_height_m
 from weather_aug.errors import IntegrityError, SceneError
 from weather_aug.particles.shelter import Shelter
-from weather_aug.render.light import CAMERA_HEIGHT_M, camera_height_m
 from weather_aug.scene import shelter as module
 from weather_aug.scene import store
 from weather_aug.scene.scene import WeatherScene

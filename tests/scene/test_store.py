@@ -20,8 +20,8 @@ from tiny_clip import TinyClip, digests_of
 
 from weather_aug import _files
 from weather_aug.clip.types import FrameKey
+from weather_aug.edit.ambience import Ambience
 from weather_aug.errors import DataError, IntegrityError, SceneError, WeatherAugError
-from weather_aug.render.light import Ambience
 from weather_aug.scene import store
 from weather_aug.scene.scene import WeatherScene
 

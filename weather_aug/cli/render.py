@@ -12,8 +12,9 @@ from tyro.conf import Positional
 from weather_aug import _files
 from weather_aug.cli.terminal import check_folder, say, to_people
 from weather_aug.errors import ArgumentError, DataError, printable
+from weather_aug.severity import parse_severity
 from weather_aug.timeline import WeatherTimeline
-from weather_aug.weather import Weather, parse_severity
+from weather_aug.weather import Weather
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,8 @@ Float64 = NDArray[np.float64]
 RIGID_TOLERANCE = 1e-4
 MAX_SPEED_M_PER_S = 150.0
 MAX_TURNING_RAD_PER_S = 6.0
+FAR_DEPTH_M = 60000.0
+"""float16 ends here; a greater depth is the sky or beyond measure."""
 
 
 class FrameKey(NamedTuple):

@@ -22,7 +22,8 @@ from torch import Tensor
 from weather_aug._checks import finite
 from weather_aug._keys import check_seed
 from weather_aug.air import Air, air_of
-from weather_aug.clip.types import Camera
+from weather_aug.clip.types import FAR_DEPTH_M, Camera
+from weather_aug.edit.ambience import Ambience
 from weather_aug.particles.shelter import Shelter
 from weather_aug.render import batch_shade
 from weather_aug.render.batch_checks import (
@@ -38,8 +39,6 @@ from weather_aug.render.batch_splat import Layer
 from weather_aug.render.fields import RigMotion
 from weather_aug.render.fog import fog_volume_of
 from weather_aug.render.label import least_linear_contrast
-from weather_aug.render.light import Ambience
-from weather_aug.render.medium import FAR_DEPTH_M
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.taxonomy import SKY
 from weather_aug.weather import Weather

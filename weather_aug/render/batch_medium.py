@@ -10,9 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from weather_aug.clip.types import Camera
+from weather_aug.clip.types import FAR_DEPTH_M, Camera
 from weather_aug.render.medium import (
-    FAR_DEPTH_M,
     FLATTEST_SINE,
     LAYER_M,
     LONGEST_M,

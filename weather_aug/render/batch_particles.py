@@ -17,6 +17,7 @@ from torch import Tensor
 
 from weather_aug.air import Air
 from weather_aug.clip.types import Camera
+from weather_aug.edit.ambience import Ambience
 from weather_aug.errors import ArgumentError, printable
 from weather_aug.particles.field import ParticleField
 from weather_aug.particles.resolve import Resolved
@@ -26,7 +27,7 @@ from weather_aug.render.batch_medium import AirColumn
 from weather_aug.render.batch_project import concatenated, project
 from weather_aug.render.batch_splat import Layer, empty_layer, splat
 from weather_aug.render.fields import RigMotion, fields_of, resolved_of, splats_of
-from weather_aug.render.light import Ambience, particle_colour
+from weather_aug.render.light import particle_colour
 from weather_aug.render.medium import Medium, Optics
 from weather_aug.render.options import RenderOptions
 from weather_aug.render.project import BAND_ROWS, LARGE, split_by_band

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from weather_aug.colour import LUMINANCE
+from weather_aug.edit.ambience import Ambience
 from weather_aug.edit.physical.overcast import ZENITH_GAIN, tone
 from weather_aug.render.batch_medium import AirColumn
 from weather_aug.render.label import (
@@ -18,7 +19,6 @@ from weather_aug.render.label import (
     LEAST_TRANSMITTANCE,
     NEIGHBOURHOOD_PX,
 )
-from weather_aug.render.light import Ambience
 from weather_aug.taxonomy import IGNORE, SKY
 
 

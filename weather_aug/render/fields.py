@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from weather_aug.air import Air
 from weather_aug.clip.types import Camera
+from weather_aug.edit.ambience import Ambience
 from weather_aug.particles import statistics
 from weather_aug.particles.field import ParticleField, Window
 from weather_aug.particles.published import PublishedField, field_from_world
 from weather_aug.particles.published_presets import published_preset
 from weather_aug.particles.resolve import DEPTH_BINS, Resolved
 from weather_aug.particles.shelter import Shelter, exposed
-from weather_aug.render.light import Ambience, particle_colour
+from weather_aug.render.light import particle_colour
 from weather_aug.render.medium import Medium, Optics
 from weather_aug.render.options import RenderOptions
 from weather_aug.render.project import project, sorted_in_blocks

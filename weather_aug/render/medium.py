@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from weather_aug._compiled import compiled, inlined
+from weather_aug.clip.types import FAR_DEPTH_M
 from weather_aug.render.froxels import share_row
 
-FAR_DEPTH_M = 60000.0
-"""float16 ends here; a greater depth is the sky or beyond measure."""
 LAYER_M = 1000.0
 """Height of the layer of weather: a ray to the sky ends at its top."""
 LONGEST_M = 20_000.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from weather_aug._checks import finite
 from weather_aug.errors import ArgumentError, printable
@@ -13,6 +13,14 @@ Alignment = Literal["world", "camera"]
 FallSpeed = Literal["brandes", "atlas"]
 Preset = Literal["physical", "weatheredit", "weatheredit-nuscenes"]
 Ablation = Literal["none", "attributes", "dynamics", "alignment"]
+LabelPolicy = Literal["ignore_unseen", "keep", "acdc"]
+
+EFFECTS = (
+    *("relight", "sky", "film", "mirror", "puddles", "ripples", "snow_cover", "tracks"),
+    *("lamps", "spray", "drops", "wipers", "lens_veil", "exposure", "noise", "glare"),
+    *("compression",),
+)
+"""What weather does to a picture besides its particles and its air; each can be left out."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +47,12 @@ class RenderOptions:
     medium, to compare with. They know no severity."""
     ablation: Ablation = "none"
     """What of that release is left out; only with its presets."""
+    without: tuple[str, ...] = ()
+    """Effects that are left out, names from `EFFECTS`."""
+    labels: LabelPolicy = "ignore_unseen"
+    """What becomes of a label whose surface cannot be seen: "ignore_unseen" turns it into 255,
+    "keep" leaves it, "acdc" leaves what a picture of the same place in clear weather would tell
+    (what does not move) and turns the rest into 255, as ACDC's annotators did."""
 
     def __post_init__(self) -> None:
         count = finite("max_particles", self.max_particles, 0, MAX_PARTICLES // 2)
@@ -51,6 +65,7 @@ class RenderOptions:
                 known = ", ".join(repr(choice) for choice in allowed)
                 raise ArgumentError(f"{name} must be one of {known}, got {printable(value)!r}")
         object.__setattr__(self, "multiple_scattering", bool(self.multiple_scattering))
+        object.__setattr__(self, "without", _effects(self.without))
         if self.preset == "physical":
             if self.ablation != "none":
                 raise ArgumentError(
@@ -68,6 +83,10 @@ class RenderOptions:
                     "leave it out (the release is aligned with the camera; see ablation)"
                 )
 
+    def has(self, effect: str) -> bool:
+        """Whether an effect is drawn."""
+        return effect not in self.without
+
     @property
     def needs_rig(self) -> bool:
         """Whether the particles depend on where the rig has been."""
@@ -80,6 +99,21 @@ _ALLOWED = {
     "multiple_scattering": (False, True),
     "preset": get_args(Preset),
     "ablation": get_args(Ablation),
+    "labels": get_args(LabelPolicy),
 }
+
+
+def _effects(names: Any) -> tuple[str, ...]:
+    """Names of effects, each once, in the order of `EFFECTS`; refuse what is none."""
+    if isinstance(names, str):
+        raise ArgumentError(f'without must be a sequence of names; write without=("{names}",)')
+    chosen = set(names)
+    unknown = sorted(chosen - set(EFFECTS), key=str)
+    if unknown:
+        raise ArgumentError(
+            f"without: {printable(unknown[0])!r} is no effect; there are {', '.join(EFFECTS)}"
+        )
+    return tuple(name for name in EFFECTS if name in chosen)
+
 
 DEFAULT_OPTIONS = RenderOptions()

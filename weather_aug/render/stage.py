@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from weather_aug.air import Air
 from weather_aug.clip.types import Camera
 from weather_aug.colour import LUMINANCE, SRGB_LEVELS_LINEAR
+from weather_aug.edit.ambience import Ambience
 from weather_aug.edit.physical.overcast import ZENITH_GAIN, tone
 from weather_aug.particles.field import ParticleField, Window
 from weather_aug.particles.resolve import DEPTH_BINS, FAR_M, shutter_turning_rad_per_s
@@ -32,7 +33,6 @@ from weather_aug.render.label import (
     LEAST_CONTRAST_LEVELS,
     least_linear_contrast,
 )
-from weather_aug.render.light import Ambience
 from weather_aug.render.medium import SPRAY_HEIGHT_M, Medium, Optics, optical_depth
 from weather_aug.render.options import RenderOptions
 from weather_aug.render.project import BAND_ROWS, split_by_band

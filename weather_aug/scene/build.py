@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from weather_aug import _files, _lock
 from weather_aug.clip.types import Clip, Frame
+from weather_aug.edit.ambience import ambience_of
 from weather_aug.errors import (
     ArgumentError,
     ClipError,
@@ -22,7 +23,6 @@ from weather_aug.errors import (
     OutputError,
     printable,
 )
-from weather_aug.render.light import ambience_of
 from weather_aug.scene import store
 from weather_aug.scene.policy import TYPES
 from weather_aug.scene.shelter import View, shelter_of

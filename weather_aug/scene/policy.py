@@ -11,7 +11,8 @@ from typing import Any
 from weather_aug._checks import finite
 from weather_aug._keys import key_of, uniforms
 from weather_aug.errors import ArgumentError, printable
-from weather_aug.weather import Weather, parse_severity
+from weather_aug.severity import parse_severity
+from weather_aug.weather import Weather
 
 TYPES = ("clear", "rain", "snow", "fog")
 _FIELDS = ("types", "severity", "falling")

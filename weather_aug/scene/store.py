@@ -28,9 +28,9 @@ from weather_aug import _files
 from weather_aug._checks import MAX_PIXELS
 from weather_aug._png import png_bytes
 from weather_aug.clip.types import RIGID_TOLERANCE, Camera, Frame, FrameKey
+from weather_aug.edit.ambience import CAMERA_HEIGHT_M, CAMERA_HEIGHT_RANGE_M, Ambience
 from weather_aug.errors import ArgumentError, DataError, IntegrityError, SceneError, printable
 from weather_aug.particles.shelter import CELL_M, Shelter
-from weather_aug.render.light import CAMERA_HEIGHT_M, CAMERA_HEIGHT_RANGE_M, Ambience
 from weather_aug.taxonomy import CLASSES, IGNORE
 
 FORMAT = "weather_aug scene"

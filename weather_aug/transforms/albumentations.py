@@ -13,9 +13,9 @@ from weather_aug._extras import require
 from weather_aug._keys import key_of, uniforms
 from weather_aug.clip.prior import geometric_prior_depth
 from weather_aug.clip.types import Camera, Frame, FrameKey
+from weather_aug.edit.ambience import ambience_of
 from weather_aug.errors import ArgumentError, printable
 from weather_aug.render.compose import RenderedFrame, render
-from weather_aug.render.light import ambience_of
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.taxonomy import IGNORE, SKY

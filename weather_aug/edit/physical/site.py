@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -116,7 +117,7 @@ def site_of(frame: Frame, axes_world: Float64, camera_height_m: float) -> Site:
         axes_world: (3, 3), rows along the street, to its left, up.
         camera_height_m: Of the camera over the road, where too little of the road is seen to tell.
     """
-    height, width = frame.image.shape[:2]
+    width = frame.image.shape[1]
     step = -(-width // CELLS_ACROSS)
     plane = _road_plane(frame, axes_world, camera_height_m)
     classes = _classes(frame, axes_world, plane)
@@ -145,7 +146,7 @@ def street_rays(camera: Camera, axes_world: Float64, shape: tuple[int, int], ste
     return (across + down + street_from_camera[:, 2]).astype(np.float32)
 
 
-def _centres(plane: NDArray, step: int) -> NDArray:
+def _centres(plane: NDArray[Any], step: int) -> NDArray[Any]:
     """Values (h, w) at the cells' centres of a plane (H, W)."""
     height, width = plane.shape
     rows = np.minimum(np.arange(-(-height // step)) * step + step // 2, height - 1)

@@ -47,8 +47,6 @@ BEYOND_PICTURE = 1.0
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
-Window = tuple[int, int, int, int]
-"""(top, left, height, width) of a part of a picture, pixels."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,17 +11,16 @@ from numpy.typing import NDArray
 
 from weather_aug._keys import check_seed
 from weather_aug.air import Air, air_of
-from weather_aug.clip.types import Camera, Frame, FrameKey
+from weather_aug.clip.types import Camera, Frame, FrameKey, Window
 from weather_aug.edit.ambience import Ambience
+from weather_aug.edit.surface import depth_of, surface_of
 from weather_aug.errors import ArgumentError
-from weather_aug.particles.field import Window
 from weather_aug.particles.shelter import Shelter
 from weather_aug.render.fields import RigMotion, fields_of
 from weather_aug.render.label import NEIGHBOURHOOD_PX, readable_labels
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.render.scattering import scattering_margin_px
 from weather_aug.render.stage import Planes, Stage
-from weather_aug.render.surface import depth_of, surface_of
 from weather_aug.taxonomy import SKY
 from weather_aug.weather import Weather
 

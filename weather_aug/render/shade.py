@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from weather_aug._compiled import compiled
+from weather_aug.edit.surface import depth_row, light_row, sky_row
 from weather_aug.render.medium import air_row, rays_across, row_space
 from weather_aug.render.project import BAND_ROWS, LARGE
-from weather_aug.render.surface import depth_row, light_row, sky_row
 from weather_aug.render.tile import TILE_FLOATS, blend_band, cover_splat
 
 

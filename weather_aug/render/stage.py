@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug.air import Air
-from weather_aug.clip.types import Camera
+from weather_aug.clip.types import Camera, Window
 from weather_aug.colour import LUMINANCE, SRGB_LEVELS_LINEAR
 from weather_aug.edit.ambience import Ambience
 from weather_aug.edit.physical.overcast import ZENITH_GAIN, tone
-from weather_aug.particles.field import ParticleField, Window
+from weather_aug.edit.surface import Surface, depth_of, repainted, ring_of
+from weather_aug.particles.field import ParticleField
 from weather_aug.particles.resolve import DEPTH_BINS, FAR_M, shutter_turning_rad_per_s
 from weather_aug.particles.shelter import Shelter
 from weather_aug.render.fields import (
@@ -38,7 +39,6 @@ from weather_aug.render.options import RenderOptions
 from weather_aug.render.project import BAND_ROWS, split_by_band
 from weather_aug.render.scattering import scattered_background
 from weather_aug.render.shade import Tone, shade
-from weather_aug.render.surface import Surface, depth_of, repainted, ring_of
 from weather_aug.weather import Weather
 
 Float32 = NDArray[np.float32]

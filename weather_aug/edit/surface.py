@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug._compiled import compiled
-from weather_aug.clip.types import FAR_DEPTH_M, Frame
-from weather_aug.particles.field import Window
+from weather_aug.clip.types import FAR_DEPTH_M, Frame, Window
 from weather_aug.taxonomy import SKY
 
 Float32 = NDArray[np.float32]

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from weather_aug._keys import key_of
 from weather_aug.air import Air
-from weather_aug.clip.types import Camera
+from weather_aug.clip.types import Camera, Window
 from weather_aug.errors import ArgumentError
 from weather_aug.particles import kernels
 from weather_aug.particles.resolve import (

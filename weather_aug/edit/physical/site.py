@@ -38,6 +38,7 @@ GROUND_TOLERANCE_M = 0.22
 GROUND_TOLERANCE_PER_M = 0.012
 ROAD_HALF_WIDTH_M = 9.0
 COLOUR_BLUR_PX = 9
+GAP_PX = 12
 BUILDING = TRAIN_ID["building"]
 
 
@@ -51,7 +52,8 @@ class Site:
     camera_height_m: float
     step: int
     classes: UInt8
-    """(H, W) train ids: the label's, and guessed from geometry and colour where there is none."""
+    """(H, W) train ids: the label's, and guessed from geometry and colour where there is none; 255
+    stays in wide unlabelled places (the own bonnet)."""
     plane: Float64
     """(3,) of the road: up = plane[0] + plane[1] along + plane[2] left, street axes."""
 
@@ -112,8 +114,8 @@ def site_of(frame: Frame, axes_world: Float64, camera_height_m: float) -> Site:
     """Look at a frame with depth.
 
     Args:
-        frame: With `depth_m`; a label says what surfaces are, geometry and colour where it is
-            silent (255) or there is none.
+        frame: With `depth_m`; a label says what surfaces are, geometry and colour where there is
+            none.
         axes_world: (3, 3), rows along the street, to its left, up.
         camera_height_m: Of the camera over the road, where too little of the road is seen to tell.
     """
@@ -195,40 +197,45 @@ def _through_origin(plane: Float64, origin: Float64) -> Float64:
 
 
 def _classes(frame: Frame, axes_world: Float64, plane: Float64) -> UInt8:
-    """Train ids (H, W): the label's, guessed where it is 255 or there is none."""
-    if frame.label is not None and not (frame.label == IGNORE).any():
-        return frame.label
+    """Train ids (H, W): the label's, and guesses where there is none."""
+    if frame.label is not None:
+        return _without_gaps(frame.label)
     camera = frame.camera
-    label = np.full(frame.image.shape[:2], IGNORE, np.uint8) if frame.label is None else frame.label
-    (fx, fy), (cx, cy) = camera.focal_px, camera.principal_px
-    street_from_camera = axes_world @ camera.world_from_camera[:3, :3]
+    rays = axes_world @ camera.world_from_camera[:3, :3]
     origin = axes_world @ camera.centre_world
     above = origin[2] - plane[0] - plane[1:] @ origin[:2]
-    climb = (
-        street_from_camera[2] - plane[1] * street_from_camera[0] - plane[2] * street_from_camera[1]
-    )
-    out = np.empty_like(label)
+    climb = np.array([-plane[1], -plane[2], 1.0]) @ rays
+    numbers = (*camera.focal_px, *camera.principal_px, above, *climb, *rays[1])
+    out = np.empty(frame.image.shape[:2], np.uint8)
     _guess(
         cv2.blur(frame.image, (COLOUR_BLUR_PX, COLOUR_BLUR_PX)),
         np.ascontiguousarray(np.asarray(frame.depth_m, np.float32)),
-        np.ascontiguousarray(label),
-        np.array([fx, fy, cx, cy, above, *climb, *street_from_camera[1]], np.float32),
+        np.array(numbers, np.float32),
         out,
     )
     return out
 
 
+def _without_gaps(label: UInt8) -> UInt8:
+    """The label with its narrow unlabelled gaps closed by what is nearest; wide ones stay 255."""
+    gap = label == IGNORE
+    if not gap.any() or gap.all():
+        return label
+    distance, nearest = cv2.distanceTransformWithLabels(
+        gap.astype(np.uint8), cv2.DIST_L1, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    by_number = np.full(int(nearest.max()) + 1, IGNORE, np.uint8)
+    by_number[nearest[~gap]] = label[~gap]
+    return np.where(gap & (distance <= GAP_PX), by_number[nearest], label)
+
+
 @compiled
-def _guess(image, depth, label, geometry, out):
+def _guess(image, depth, geometry, out):
     """Name what nobody labelled: sky by endless depth, ground by height, green by colour."""
     fx, fy, cx, cy, above = geometry[0], geometry[1], geometry[2], geometry[3], geometry[4]
-    for row in range(label.shape[0]):
+    for row in range(out.shape[0]):
         y = (np.float32(row) - cy) / fy
-        for column in range(label.shape[1]):
-            known = label[row, column]
-            if known != np.uint8(IGNORE):
-                out[row, column] = known
-                continue
+        for column in range(out.shape[1]):
             z = depth[row, column]
             if not (z > np.float32(0.0)) or z >= np.float32(FAR_DEPTH_M):
                 out[row, column] = np.uint8(SKY)

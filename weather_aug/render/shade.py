@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from weather_aug._compiled import compiled
+from weather_aug._rows import encode_row
 from weather_aug.edit.surface import depth_row, light_row, sky_row
 from weather_aug.render.medium import air_row, rays_across, row_space
 from weather_aug.render.project import BAND_ROWS, LARGE
@@ -179,28 +180,6 @@ def _fog_row(through, airlight, red, green, blue, gap):
         dr, dg, db = abs(dr), abs(dg), abs(db)
         most = dr if dr > dg else dg
         gap[x] = most if most > db else db
-
-
-@compiled
-def encode_row(light, out):
-    """Turn linear light into sRGB levels, rounded, with an error of 0.1 of a level before that.
-
-    A polynomial in the square root on the power branch (largest error 0.083 levels), the exact
-    line below it; every 8-bit level survives decoding and encoding.
-    """
-    zero, one = np.float32(0.0), np.float32(1.0)
-    for x in range(light.shape[0]):
-        v = light[x]
-        v = v if v > zero else zero
-        v = v if v < one else one
-        s = np.sqrt(v)
-        p = np.float32(-1.6236571) + s * np.float32(0.5173023)
-        p = np.float32(2.0315735) + s * p
-        p = np.float32(-1.4027363) + s * p
-        p = np.float32(1.5179509) + s * p
-        p = np.float32(-0.0401096) + s * p
-        p = p if v > np.float32(0.0031308) else np.float32(12.92) * v
-        out[x] = np.uint8(np.int32(p * np.float32(255.0) + np.float32(0.5)))
 
 
 @compiled

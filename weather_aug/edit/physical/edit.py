@@ -10,7 +10,14 @@ from weather_aug.clip.types import Camera, Frame, Window
 from weather_aug.colour import LUMINANCE
 from weather_aug.edit.ambience import Ambience
 from weather_aug.edit.physical.dress import Geometry, Look, dress
-from weather_aug.edit.physical.layers import ILLUMINATION, ROUGH, ROUGH_SKY, SHARP, SHARP_SKY, Layers
+from weather_aug.edit.physical.layers import (
+    ILLUMINATION,
+    ROUGH,
+    ROUGH_SKY,
+    SHARP,
+    SHARP_SKY,
+    Layers,
+)
 from weather_aug.edit.physical.materials import material_table
 from weather_aug.edit.physical.noise import noise_tile
 from weather_aug.edit.physical.overcast import CONTRAST_LOSS, ZENITH_GAIN, tone
@@ -57,9 +64,11 @@ def look_of(weather, ambience, layers, has, overcast) -> Look:
     # A white surface in the open is as bright as the mean of the sky; streets see half of it.
     lit = float(np.median(layers.maps[ILLUMINATION]))
     exposure = (0.65 * white / lit) ** (0.6 * overcast)
+    exposure = min(max(exposure, 0.92), 1.8) * (1.0 - 0.15 * weather.snow_cover * has("snow_cover"))
     values = (
         weather.overcast if has("sky") else 0.0,
         overcast * (1 - CONTRAST_LOSS * overcast),
+        exposure,
         ZENITH_GAIN,
         *ambience.airlight,
         wet if has("film") else 0.0,
@@ -70,7 +79,6 @@ def look_of(weather, ambience, layers, has, overcast) -> Look:
         weather.road_snow_cover if has("snow_cover") else 0.0,
         weather.snow_depth_m if has("snow_cover") else 0.0,
         1.0 if has("tracks") else 0.0,
-        min(max(exposure,0.7),1.8)*(1.0 - 0.15 * weather.snow_cover * has("snow_cover")),
         0.97 * white,
     )
     return Look(*(np.float32(v) for v in values))
@@ -81,8 +89,15 @@ def geometry_of(camera: Camera, ambience: Ambience, plane) -> Geometry:
     origin = ambience.axes_world @ camera.centre_world
     climb = np.array([-plane[1], -plane[2], 1.0]) @ rays
     height = origin[2] - plane[0] - plane[1:] @ origin[:2]
-    values = (*camera.focal_px, *camera.principal_px, *rays[0], *rays[1], *climb,
-              *np.mod(origin[:2], NOISE_PERIOD_M), height)
+    values = (
+        *camera.focal_px,
+        *camera.principal_px,
+        *rays[0],
+        *rays[1],
+        *climb,
+        *np.mod(origin[:2], NOISE_PERIOD_M),
+        height,
+    )
     return Geometry(*(np.float32(v) for v in values))
 
 
@@ -91,6 +106,7 @@ def small_maps(layers: Layers, look: Look, curve, matrix) -> Float32:
     maps = layers.maps.astype(np.float32)
     levels = np.interp  # toned light of linear light
     from weather_aug.colour import SRGB_LEVELS_LINEAR
+
     air = np.array([look.red, look.green, look.blue]) * (1 + 0.5 * look.zenith_gain)
     out = np.empty((14, *maps.shape[1:]), np.float32)
     out[:4] = maps[:4]

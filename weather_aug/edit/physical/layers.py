@@ -11,10 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from weather_aug.colour import LUMINANCE
-from weather_aug.edit.physical import settling
-from weather_aug.edit.physical.site import Site
-
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]

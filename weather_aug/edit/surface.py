@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,9 +18,6 @@ from weather_aug.taxonomy import SKY
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
-
-RING_PX = 7
-"""Where only depth tells of the sky, it may show this far around what is far."""
 
 
 class Surface(NamedTuple):
@@ -71,19 +67,6 @@ def depth_of(surface: Surface, window: Window) -> Float32:
     out = np.empty(window[2:], np.float32)
     _fill_depth(surface, window, out.view(np.int32), out)
     return out
-
-
-def ring_of(surface: Surface, window: Window) -> NDArray[np.bool_]:
-    """Where the sky may show though nobody labelled it, (H, W); empty where there are labels.
-
-    That is what is far, and the ring around it, which depth sensors miss. Inside only pixels as
-    bright as the sky are taken for it, so that the ring costs nothing where the edge was right.
-    """
-    if len(surface.label):
-        return np.empty((0, 0), np.bool_)
-    far = (depth_of(surface, window) == np.inf).astype(np.uint8)
-    ringed: NDArray[np.bool_] = cv2.dilate(far, np.ones((RING_PX, RING_PX), np.uint8)).astype(bool)
-    return ringed
 
 
 @compiled

@@ -13,7 +13,11 @@ from weather_aug._keys import check_seed
 from weather_aug.air import Air, air_of
 from weather_aug.clip.types import Camera, Frame, FrameKey, Window
 from weather_aug.edit.ambience import Ambience
-from weather_aug.edit.surface import depth_of, surface_of
+from weather_aug.edit.physical.edit import edited
+from weather_aug.edit.physical.layers import Layers, layers_of
+from weather_aug.edit.physical.look import changes_background
+from weather_aug.edit.physical.site import site_of
+from weather_aug.edit.surface import Surface, depth_of, repainted, surface_of
 from weather_aug.errors import ArgumentError
 from weather_aug.particles.shelter import Shelter
 from weather_aug.render.fields import RigMotion, fields_of
@@ -63,6 +67,7 @@ def render(
     air: Air | None = None,
     shelter: Shelter | None = None,
     rig: RigMotion | None = None,
+    layers: Layers | None = None,
     options: RenderOptions = DEFAULT_OPTIONS,
 ) -> RenderedFrame:
     """Render `frame` in `weather`: a pure function of its arguments.
@@ -81,6 +86,8 @@ def render(
         shelter: Bridges and roofs of the street, None for an open sky.
         rig: Motion of the reference camera, for options that carry the particles along with it; if
             None, this camera stood at time 0 where it stands.
+        layers: What the editor knows of the frame; if None, it looks at the frame now, and the way
+            driven is taken to go straight ahead.
         options: Choices besides the weather.
 
     Raises:
@@ -106,7 +113,7 @@ def render(
     if air is None:
         air = air_of(weather, frame.time_s, seed)
     outer = _with_margin(window, _margin_px(frame, options), height, width)
-    surface = surface_of(frame)
+    surface = _edited(frame, weather, ambience, outer, layers, options)
     stage = Stage(surface, outer, frame.camera, weather, ambience, seed, air, options)
     if options.preset == "physical":
         fields = fields_of(weather, seed, air, ambience.axes_world, options, rig)
@@ -115,6 +122,24 @@ def render(
         here = frame.camera.world_from_camera
         shot = stage.published(rig or RigMotion(here, here), frame.time_s)
     return _trimmed(shot, frame, outer, window)
+
+
+def _edited(
+    frame: Frame,
+    weather: Weather,
+    ambience: Ambience,
+    window: Window,
+    layers: Layers | None,
+    options: RenderOptions,
+) -> Surface:
+    """The frame's surface with the weather's background in a window."""
+    surface = surface_of(frame)
+    if not changes_background(weather, options.without):
+        return surface
+    if layers is None:
+        layers = layers_of(site_of(frame, ambience.axes_world, ambience.camera_height_m))
+    image = edited(frame, layers, weather, ambience, window, options.without)
+    return repainted(surface, image, window)
 
 
 def checked_window(window: Window | None, height: int, width: int) -> Window:
@@ -185,12 +210,8 @@ def _with_margin(window: Window, margin: int, height: int, width: int) -> Window
 
 
 def _margin_px(frame: Frame, options: RenderOptions) -> int:
-    """How far around a pixel its label and colour depend on the picture.
-
-    Labels look around themselves, and so does the sky where only depth tells of it.
-    """
-    looks = 1 if frame.label is not None else 2
-    margin = looks * (NEIGHBOURHOOD_PX // 2)
+    """How far around a pixel its label and colour depend on the picture."""
+    margin = NEIGHBOURHOOD_PX // 2
     if options.multiple_scattering:
         margin += scattering_margin_px(max(frame.camera.focal_px), math.inf)
     return margin

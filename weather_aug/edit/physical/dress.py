@@ -61,36 +61,6 @@ class Geometry(NamedTuple):
     """Over the road's plane, metres."""
 
 
-class Look(NamedTuple):
-    """What the weather does to surfaces, float32."""
-
-    sky: np.float32
-    """How far the sky is an overcast one."""
-    flattening: np.float32
-    """Exponent of the light that takes the place of the sun's."""
-    exposure: np.float32
-    """Gain on everything but the sky and snow."""
-    zenith_gain: np.float32
-    red: np.float32
-    """Airlight."""
-    green: np.float32
-    blue: np.float32
-    film: np.float32
-    """Wetness, as far as it darkens."""
-    mirror: np.float32
-    """Wetness, as far as it mirrors."""
-    flooded: np.float32
-    """Share of the wet road where the film covers the stones."""
-    puddles: np.float32
-    snow: np.float32
-    road_snow: np.float32
-    snow_depth_m: np.float32
-    tracks: np.float32
-    """1 where wheels keep snow off the road, else 0."""
-    snow_light: np.float32
-    """Most luminance of snow."""
-
-
 @compiled
 def dress(surface, classes, window, geometry, look, curve, matrix, table, maps, step, tile, out):
     """Paint one window's background in the weather.

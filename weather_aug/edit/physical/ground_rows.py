@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from weather_aug._compiled import compiled, inlined
+from weather_aug._compiled import inlined
 from weather_aug.edit.physical.materials import COVER, MIRROR, POROSITY, ROAD
 from weather_aug.edit.physical.noise import ground_noise
 from weather_aug.edit.physical.spread import spread_run
@@ -55,7 +55,7 @@ def film_ratio(albedo):
     return through / (one - np.float32(FILM_BACK) * albedo)
 
 
-@compiled
+@inlined
 def ground_run(run, depth, geometry, look, material, small, cell, share, tile, b):
     """Wet and snow on pixels x0 to x1 of one ground class.
 
@@ -109,7 +109,7 @@ def _fuzz(size_m):
     return soft if soft < np.float32(0.5) else np.float32(0.5)
 
 
-@compiled
+@inlined
 def _places(run, depth, geometry, b):
     """Where the pixels are on the street, how flat they are seen, and how large they are."""
     x0, x1, left, y = run
@@ -132,7 +132,7 @@ def _places(run, depth, geometry, b):
         b[SIZE, x] = z * per_fy / (sine if sine > np.float32(0.02) else np.float32(0.02))
 
 
-@compiled
+@inlined
 def _tracks(x0, x1, strength, b):
     """From how far left of the way to how far in a wheel's track; other lanes are driven less."""
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
@@ -145,7 +145,7 @@ def _tracks(x0, x1, strength, b):
         b[SIDE, x] = strength * track * (driven if driven > zero else zero)
 
 
-@compiled
+@inlined
 def film(x0, x1, wet, lit, b):
     """Darken a run under a film of water; row `lit` of the buffer is the light on it."""
     least, most, one = np.float32(0.01), np.float32(0.95), np.float32(1.0)
@@ -159,7 +159,7 @@ def film(x0, x1, wet, lit, b):
             b[channel, x] = value * (one + wet * (film_ratio(albedo) - one))
 
 
-@compiled
+@inlined
 def _mirror(x0, x1, shine, flooded_share, b):
     """What the film and the puddles mirror."""
     one = np.float32(1.0)
@@ -177,7 +177,7 @@ def _mirror(x0, x1, shine, flooded_share, b):
             b[channel, x] = kept * b[channel, x] + stones * smeared + calm * sharp
 
 
-@compiled
+@inlined
 def _cover(x0, x1, amount, b):
     one = np.float32(1.0)
     for x in range(x0, x1):
@@ -185,7 +185,7 @@ def _cover(x0, x1, amount, b):
         b[COVERED, x] = covered(spared, _fuzz(b[SIZE, x]), b[NOISE, x])
 
 
-@compiled
+@inlined
 def _lay(x0, x1, look, b):
     """Snow over what lies there; a little of it shows through."""
     asphalt = np.float32(ASPHALT_ALBEDO)

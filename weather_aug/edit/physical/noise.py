@@ -28,6 +28,8 @@ COARSE_SHARE = 0.62
 """Of the sum of both looks."""
 _TURN = (0.8, 0.6)
 """Cosine and sine of the angle between the looks."""
+PERIOD_M = 5 * TILE_CELLS * CELL_M * COARSER
+"""Along and left: a multiple of both looks' periods, turned by `_TURN` or not."""
 _COARSEST_LATTICE, _OCTAVES, _GAIN = 8, 6, 0.62
 
 

@@ -39,6 +39,7 @@ GROUND_TOLERANCE_PER_M = 0.012
 ROAD_HALF_WIDTH_M = 9.0
 COLOUR_BLUR_PX = 9
 GAP_PX = 12
+SPECKLE_PX = 5
 BUILDING = TRAIN_ID["building"]
 
 
@@ -213,7 +214,7 @@ def _classes(frame: Frame, axes_world: Float64, plane: Float64) -> UInt8:
         np.array(numbers, np.float32),
         out,
     )
-    return out
+    return cv2.medianBlur(out, SPECKLE_PX)
 
 
 def _without_gaps(label: UInt8) -> UInt8:

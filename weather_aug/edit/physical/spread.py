@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from weather_aug._compiled import compiled
+from weather_aug._compiled import inlined
 
 
-@compiled
+@inlined
 def spread_run(small, first, count, cell, share, x0, x1, b, slot):
     """Maps `first` to `first + count` of one row at pixels x0 to x1, into rows `slot` on of `b`.
 

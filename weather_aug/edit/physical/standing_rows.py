@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from weather_aug._compiled import compiled
+from weather_aug._compiled import inlined
 from weather_aug.edit.physical.ground_rows import (
     covered,
     film,
@@ -30,7 +30,7 @@ BURIED_RANGE_M = 30.0
 """Farther off, the road's plane is not known to centimetres."""
 
 
-@compiled
+@inlined
 def caps_row(kinds, depth, fy, b, class_above):
     """How far each pixel lies below the upper edge of its own thing, metres."""
     no_cap, per_fy = np.float32(NO_CAP_M), np.float32(1.0) / fy
@@ -47,7 +47,7 @@ def caps_row(kinds, depth, fy, b, class_above):
         class_above[x] = kinds[x]
 
 
-@compiled
+@inlined
 def film_run(run, look, material, small, cell, share, b):
     """Darken wet walls, trunks and clothes."""
     x0, x1, _, _ = run
@@ -55,9 +55,9 @@ def film_run(run, look, material, small, cell, share, b):
     film(x0, x1, look.film * material[POROSITY], LIT, b)
 
 
-@compiled
+@inlined
 def standing_run(run, depth, geometry, look, material, small, cell, share, tile, b):
-    """Snow on upper edges, level parts and leaves, and where it buries the foot; see `ground_run`."""
+    """Snow on upper edges, level parts and leaves and around the foot; see `ground_run`."""
     x0, x1, left, y = run
     zero, one = np.float32(0.0), np.float32(1.0)
     spread_run(small, LIGHT, 3, cell, share, x0, x1, b, LIT)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from weather_aug._compiled import compiled
 from weather_aug.clip.types import FAR_DEPTH_M, Frame, Window
+from weather_aug.errors import ArgumentError
 from weather_aug.taxonomy import SKY
 
 Float32 = NDArray[np.float32]
@@ -55,6 +56,23 @@ def surface_of(frame: Frame) -> Surface:
         _flat(label),
         width,
     )
+
+
+def checked_window(window: Window | None, height: int, width: int) -> Window:
+    """`window` as integers, or the whole picture; refuse one that leaves the picture."""
+    if window is None:
+        return (0, 0, height, width)
+    try:
+        top, left, rows, columns = (v.__index__() for v in window)
+    except (AttributeError, TypeError, ValueError):
+        raise ArgumentError(
+            f"window must be four integers (top, left, height, width), got {window!r}"
+        ) from None
+    if not (0 <= top and 0 <= left and rows > 0 and columns > 0):
+        raise ArgumentError(f"window {window} must be (top >= 0, left >= 0, height > 0, width > 0)")
+    if top + rows > height or left + columns > width:
+        raise ArgumentError(f"window {window} leaves the picture of {height}x{width} pixels")
+    return (top, left, rows, columns)
 
 
 def repainted(surface: Surface, image: UInt8, window: Window) -> Surface:

@@ -13,13 +13,11 @@ from weather_aug._keys import check_seed
 from weather_aug.air import Air, air_of
 from weather_aug.clip.types import Camera, Frame, FrameKey, Window
 from weather_aug.edit.ambience import Ambience
-from weather_aug.edit.physical.edit import edited
-from weather_aug.edit.physical.layers import Layers, layers_of
-from weather_aug.edit.physical.look import changes_background
-from weather_aug.edit.physical.site import site_of
-from weather_aug.edit.surface import Surface, depth_of, repainted, surface_of
+from weather_aug.edit.physical.layers import Layers
+from weather_aug.edit.surface import checked_window, depth_of, surface_of
 from weather_aug.errors import ArgumentError
 from weather_aug.particles.shelter import Shelter
+from weather_aug.render.background import background_of, looked_at
 from weather_aug.render.fields import RigMotion, fields_of
 from weather_aug.render.label import NEIGHBOURHOOD_PX, readable_labels
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
@@ -113,7 +111,9 @@ def render(
     if air is None:
         air = air_of(weather, frame.time_s, seed)
     outer = _with_margin(window, _margin_px(frame, options), height, width)
-    surface = _edited(frame, weather, ambience, outer, layers, options)
+    if layers is None:
+        layers = looked_at(frame, ambience)
+    surface = background_of(frame, weather, ambience, outer, layers, options)
     stage = Stage(surface, outer, frame.camera, weather, ambience, seed, air, options)
     if options.preset == "physical":
         fields = fields_of(weather, seed, air, ambience.axes_world, options, rig)
@@ -122,41 +122,6 @@ def render(
         here = frame.camera.world_from_camera
         shot = stage.published(rig or RigMotion(here, here), frame.time_s)
     return _trimmed(shot, frame, outer, window)
-
-
-def _edited(
-    frame: Frame,
-    weather: Weather,
-    ambience: Ambience,
-    window: Window,
-    layers: Layers | None,
-    options: RenderOptions,
-) -> Surface:
-    """The frame's surface with the weather's background in a window."""
-    surface = surface_of(frame)
-    if not changes_background(weather, options.without):
-        return surface
-    if layers is None:
-        layers = layers_of(site_of(frame, ambience.axes_world, ambience.camera_height_m))
-    image = edited(frame, layers, weather, ambience, window, options.without)
-    return repainted(surface, image, window)
-
-
-def checked_window(window: Window | None, height: int, width: int) -> Window:
-    """`window` as integers, or the whole picture; refuse one that leaves the picture."""
-    if window is None:
-        return (0, 0, height, width)
-    try:
-        top, left, rows, columns = (v.__index__() for v in window)
-    except (AttributeError, TypeError, ValueError):
-        raise ArgumentError(
-            f"window must be four integers (top, left, height, width), got {window!r}"
-        ) from None
-    if not (0 <= top and 0 <= left and rows > 0 and columns > 0):
-        raise ArgumentError(f"window {window} must be (top >= 0, left >= 0, height > 0, width > 0)")
-    if top + rows > height or left + columns > width:
-        raise ArgumentError(f"window {window} leaves the picture of {height}x{width} pixels")
-    return (top, left, rows, columns)
 
 
 def warm_up() -> None:

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from weather_aug._checks import finite, image_uint8
 from weather_aug._keys import check_seed, key_of
-from weather_aug.clip.types import Camera, FrameKey
+from weather_aug.clip.types import Camera, FrameKey, Window
 from weather_aug.colour import SRGB_LEVELS_LINEAR
+from weather_aug.edit.surface import checked_window
 from weather_aug.errors import ArgumentError
-from weather_aug.particles.field import Window
 from weather_aug.render.sensor_kernels import expose, levels_of, spread_across
 from weather_aug.weather import Weather
 
@@ -377,11 +377,7 @@ def _checked_whole(whole: Float32 | None) -> Float32:
 
 
 def _check_window(window: Window, camera: Camera, compression: bool) -> None:
-    top, left, rows, columns = window
-    inside = 0 <= top and 0 <= left and rows > 0 and columns > 0
-    if not inside or top + rows > camera.height or left + columns > camera.width:
-        size = f"{camera.height}x{camera.width}"
-        raise ArgumentError(f"window {window} leaves the picture of {size} pixels")
+    checked_window(window, camera.height, camera.width)
     if compression and tuple(window) != block_window(window, camera):
         raise ArgumentError(
             f"window {window} cuts blocks of the compression; render {block_window(window, camera)}"

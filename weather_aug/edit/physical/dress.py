@@ -75,7 +75,7 @@ def dress(surface, classes, window, geometry, look, curve, matrix, table, maps, 
         matrix: (3, 3) float32 colour matrix after it.
         table: (256, 8) float32 materials.
         maps: (14, h, w) float32 on the small grid of the whole picture.
-        step: Pixels of a cell.
+        step: Pixels of a cell, float32.
         tile: Noise.
         out: (3, H, W) uint8 out.
     """
@@ -140,7 +140,7 @@ def dress(surface, classes, window, geometry, look, curve, matrix, table, maps, 
 def _cells(left, width, step, columns, cell, share):
     """For each pixel of a row, the cell before it and how far it is on the way to the next."""
     for x in range(width):
-        place = (np.float32(left + x) + np.float32(0.5)) / np.float32(step) - np.float32(0.5)
+        place = (np.float32(left + x) + np.float32(0.5)) / step - np.float32(0.5)
         place = min(max(place, np.float32(0.0)), np.float32(columns - 1))
         first = min(np.int32(place), np.int32(max(columns - 2, 0)))
         cell[x] = first
@@ -151,7 +151,7 @@ def _cells(left, width, step, columns, cell, share):
 def _small_row(maps, y, step, small):
     """All maps at the height of picture row y; whether any of its cells may be sky."""
     rows, columns = maps.shape[1], maps.shape[2]
-    place = (np.float32(y) + np.float32(0.5)) / np.float32(step) - np.float32(0.5)
+    place = (np.float32(y) + np.float32(0.5)) / step - np.float32(0.5)
     place = min(max(place, np.float32(0.0)), np.float32(rows - 1))
     upper = min(np.int32(place), np.int32(max(rows - 2, 0)))
     lower = min(upper + 1, rows - 1)

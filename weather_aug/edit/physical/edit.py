@@ -68,7 +68,7 @@ def edited(
         matrix.astype(np.float32),
         material_table(labelled=frame.label is not None),
         maps_in(layers, window, look, curve, matrix),
-        layers.step,
+        np.float32(layers.step),
         noise_tile(),
         out,
     )
@@ -91,8 +91,8 @@ def maps_in(layers: Layers, window: Window, look: Look, curve: Float64, matrix: 
     """The kernel's maps (14, h, w): the layers under the weather's light, where a window is."""
     top, _, height, _ = window
     rows = layers.maps.shape[1]
-    first = max(top // layers.step - 1, 0)
-    last = min((top + height) // layers.step + 2, rows)
+    first = max(int(top / layers.step) - 1, 0)
+    last = min(int((top + height) / layers.step) + 2, rows)
     root = np.linspace(0.0, 1.0, TABLE_STEPS)
     table = np.interp(root**2, SRGB_LEVELS_LINEAR, curve).astype(np.float32)
     sky = MEAN_SKY_GAIN * np.array([look.red, look.green, look.blue])

@@ -38,7 +38,7 @@ SHARP, SHARP_SKY, ROUGH, ROUGH_SKY = 8, 11, 12, 15
 class Layers:
     """Maps of one frame; `step` pixels of the picture are one cell."""
 
-    step: int
+    step: float
     maps: NDArray[np.float16]
     """(16, h, w), in the order of `NAMES`."""
     plane: Float64
@@ -79,4 +79,4 @@ def layers_of(site: Site, path: Float64 | None = None) -> Layers:
         maps[s] = cv2.blur(sky[idx], k)
     stack = maps.astype(np.float16)
     stack.flags.writeable = False
-    return Layers(site.step, stack, site.plane, site.classes)
+    return Layers(float(site.step), stack, site.plane, site.classes)

@@ -53,13 +53,13 @@ def guided_coefficients(
         )
     weighed_guide = weight * guide
     total = box_sum(weight, radius_cells)
-    share = np.divide(1.0, total, out=np.zeros_like(total), where=total > LEAST_WEIGHT)
+    share: Float32 = np.divide(1.0, total, out=np.zeros_like(total), where=total > LEAST_WEIGHT)
     mean_guide = box_sum(weighed_guide, radius_cells) * share
     mean_target = box_sum(weight * target, radius_cells) * share
     variance = box_sum(weighed_guide * guide, radius_cells) * share - mean_guide * mean_guide
     covariance = box_sum(weighed_guide * target, radius_cells) * share - mean_guide * mean_target
-    slope = covariance / (np.maximum(variance, 0.0) + np.float32(epsilon))
-    offset = mean_target - slope * mean_guide
+    slope: Float32 = covariance / (np.maximum(variance, np.float32(0)) + np.float32(epsilon))
+    offset: Float32 = mean_target - slope * mean_guide
     heavy = box_sum(total, radius_cells)
     share = np.divide(1.0, heavy, out=np.zeros_like(heavy), where=heavy > LEAST_WEIGHT)
     return box_sum(slope * total, radius_cells) * share, box_sum(

@@ -19,19 +19,10 @@ from numpy.typing import NDArray
 from weather_aug.colour import LUMINANCE
 from weather_aug.edit.physical.guided import box_mean, box_sum, guided_coefficients
 from weather_aug.edit.physical.site import Site
-from weather_aug.taxonomy import (
-    GROUND,
-    ROAD,
-    SIDEWALK,
-    SKY,
-    TERRAIN,
-    TRAIN_ID,
-    VEGETATION,
-)
+from weather_aug.taxonomy import GROUND, ROAD, SIDEWALK, SKY, TERRAIN, TRAIN_ID, VEGETATION
 
 Bool = NDArray[np.bool_]
 Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 DARK = 0.003
 """Linear light added before a logarithm: a level of noise weighs little there."""
@@ -39,8 +30,7 @@ DARK = 0.003
 SKY_FEATURE = (-0.5, 0.0, 1.5)
 """Weights of sRGB red, green and blue: a blue sky and a white cloud are equally sky (about 1 to
 1.2), a white wall before a blue sky is not (0.8), leaves are far off (0.2)."""
-SKY_RADIUS_CELLS = 4
-LEAVES_RADIUS_CELLS = 10
+SKY_RADIUS_CELLS, LEAVES_RADIUS_CELLS = 4, 10
 """How far into trees sky may show where the label calls it tree."""
 LOCAL_SKY_CELLS = 24
 LEAST_BLUE = 0.16
@@ -52,39 +42,29 @@ MATTE_MARGINS = (0.12, 0.08)
 """Shares of the way between the surface's feature and the sky's that are wholly one or the other:
 noise and clouds."""
 
-LIT_QUANTILE = 0.75
-LIT_SPREAD = 0.7
+LIT_QUANTILE, LIT_SPREAD, LIT_DROP = 0.75, 0.7, 0.35
 DISTANCE_BINS_M = np.geomspace(4.0, 60.0, 8)
-BIN_PRIOR_CELLS = 100
 SHADOW_DROP = 0.45
 """Log luminance by which a cast shadow is darker than the lit ground at least."""
-LIT_DROP = 0.35
-SHADOW_SIDE_CELLS = 5
-"""A darker place is shadow from this size on, and a smaller one where it is bluer, too."""
+SHADOW_SIDE_M, SHADOW_LEAST_CELLS = 1.1, 8
+"""A darker place is shadow from this size on, and a smaller one where it is bluer, too: manholes
+are not."""
 BLUER = 0.1
 SHADOW_REACH_CELLS = 5
-MARKING_WIDTH_M = 0.3
 LOCAL_LIT_CELLS = 16
-EDGE_RADIUS_CELLS = 2
-EDGE_EPSILON = 2e-4
-MARKING_CONTRAST = 0.3
+EDGE_RADIUS_CELLS, EDGE_EPSILON = 2, 2e-4
+MARKING_WIDTH_M, MARKING_CONTRAST = 0.3, 0.3
 LEAST_GAIN, MOST_GAIN = math.log(0.75), math.log(2.5)
 """Of all but the ground."""
 MOST_GROUND_GAIN = math.log(9.0)
-HOLLOW_DROPS = (2.8, 4.2)
-WALL_SHARE, LEAF_SHARE = 0.45, 0.3
-ALBEDO_SPREAD = 0.6
-PRIOR_CELLS = 60
-TERRAIN_SHARE = 0.75
-CONTACT_M = 0.4
+HOLLOW_DROPS, GUESSED_RANGE_M = (2.8, 4.2), (32.0, 60.0)
+WALL_SHARE, LEAF_SHARE, TERRAIN_SHARE = 0.45, 0.3, 0.75
+CONTACT_M, CONTACT_DARKENING, FARTHEST_M = 0.4, 0.45, 8.0
 STANDING_M, STANDING_RANGE_M = 0.15, 20.0
-CONTACT_DARKENING = 0.45
-OBJECT_EPSILON = 0.01
-OBJECT_RADIUS_CELLS = 6
-LEAST_CELLS = 20
+OBJECT_RADIUS_CELLS, OBJECT_EPSILON = 6, 0.01
+LEAST_CELLS, PRIOR_CELLS, BIN_PRIOR_CELLS = 20, 60, 100
 TINT_LIMIT = 0.35
-ROAD_ALBEDO = 0.12
-GROUND_ALBEDO = 0.18
+ROAD_ALBEDO, GROUND_ALBEDO, ALBEDO_SPREAD = 0.12, 0.18, 0.6
 
 _WALLS = tuple(TRAIN_ID[name] for name in ("building", "wall", "fence"))
 _VEHICLES = tuple(
@@ -119,10 +99,9 @@ def sky_matte(site: Site) -> tuple[Float32, Float32]:
         The compositing equation of two known colours, as in Smith and Blinn, "Blue Screen
         Matting", SIGGRAPH 1996, with one feature.
     """
-    is_sky = _area(np.equal(site.classes, SKY).view(np.uint8), site.step)
-    none = np.zeros(site.shape, np.float32)
+    is_sky = _area(np.where(site.classes == SKY, np.uint8(255), np.uint8(0)), site.step)
     if is_sky.max() < 0.5:
-        return none, none.copy()
+        return np.zeros(site.shape, np.float32), np.zeros(site.shape, np.float32)
     srgb = _srgb(site)
     feature = _mixed(srgb, SKY_FEATURE)
     # The local sky is the labelled sky without what is dark in it.
@@ -157,7 +136,8 @@ def _sky_reach(site: Site, is_sky: Float32, srgb: Float32) -> Float32:
         blueness = srgb[..., 2] - srgb[..., 0]
         blue = max(float(np.median(blueness[is_sky > 0.5])), LEAST_BLUE)
         bluish = (blueness > 0.5 * blue).astype(np.uint8)
-        holed |= cv2.dilate(bluish, np.ones((3, 3), np.uint8)) > 0
+        # Closed over what is thin, a lamp or a wire.
+        holed |= cv2.erode(cv2.dilate(bluish, np.ones((7, 7))), np.ones((5, 5))) > 0
     size = 2 * LEAVES_RADIUS_CELLS + 1
     far = holed & (cv2.dilate(near, np.ones((size, size), np.uint8)) > 0)
     return np.maximum(near, far).astype(np.float32)
@@ -166,9 +146,10 @@ def _sky_reach(site: Site, is_sky: Float32, srgb: Float32) -> Float32:
 def flattening(site: Site) -> Flattening:
     """How much light each place lacks against an even sky.
 
-    On the ground all that cast shadows take is given back, up to a gain of 9, edges and all; walls,
-    leaves and vehicles come nearer to the mean of their surroundings; the sky, lamps and signs stay
-    as they are.
+    On the ground all that cast shadows take is given back, up to a gain of 9, edges and all, but
+    for what is darker than any shadow and what lies close to a vehicle. Walls and leaves come
+    nearer to the mean of their surroundings. The sky, vehicles, lamps, signs and people stay as
+    they are: how dark they are says more of their paint than of the sun.
     """
     luma = _mixed(_srgb(site), LUMINANCE)
     level = np.log(_mixed(site.light, LUMINANCE) + np.float32(DARK))
@@ -221,6 +202,10 @@ def _ground_gain(
     # What is darker than a shadow under the open sky can be hardly sees the sky: it stays dark.
     hollow = np.clip((drop - HOLLOW_DROPS[0]) / (HOLLOW_DROPS[1] - HOLLOW_DROPS[0]), 0.0, 1.0)
     gain *= 1 - hollow
+    if site.frame.label is None:
+        # Far off, what is low passes for ground.
+        near, far = GUESSED_RANGE_M
+        gain *= np.clip((far - site.depth_m) / (far - near), 0.0, 1.0)
     gain = np.where(site.small_classes == TERRAIN, np.float32(TERRAIN_SHARE) * gain, gain)
     open_air, contact = _contact(site, ground)
     gain = (gain * open_air + contact).astype(np.float32)
@@ -231,9 +216,10 @@ def _ground_gain(
     most = cv2.dilate(np.where(plain > 0, gain, -9.0).astype(np.float32), window)
     told = most >= least
     # On a marking its own luma tells nothing of the light, the asphalt around it does.
-    share = box_mean(plain, ground.astype(np.float32), 1, empty=1.0)
+    marked = (ground & (plain == 0)).astype(np.uint8)
+    share = 1 - cv2.dilate(marked, np.ones((5, 5), np.uint8)).astype(np.float32)
     lines[..., 0], lines[..., 1] = slope * share, offset * share + gain * (1 - share)
-    lines[..., 2], lines[..., 3] = np.where(told, least, 0.0), np.where(told, most, 0.0)
+    lines[..., 2], lines[..., 3] = np.where(told, least, gain), np.where(told, most, gain)
     return lines
 
 
@@ -305,14 +291,29 @@ def _shadow(site: Site, base: Float32, lit: Float32, ground: Bool) -> tuple[Floa
         if is_lit[::3, ::3].any()
         else 1.0
     )
-    wide = cv2.morphologyEx(dark, cv2.MORPH_OPEN, np.ones((3, SHADOW_SIDE_CELLS), np.uint8))
+    wide = _wide(site, dark)
     small = dark & (blueness > usual * (1 + BLUER)).view(np.uint8)
     core = cv2.dilate(wide | small, np.ones((2 * SHADOW_REACH_CELLS + 1,) * 2, np.uint8))
     return drop, cv2.blur(core.astype(np.float32), (5, 5))
 
 
+def _wide(site: Site, dark: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(h, w) 0 or 1: the connected dark places that are a metre long or wide on the ground."""
+    _, names, boxes, centres = cv2.connectedComponentsWithStats(dark, connectivity=4)
+    columns, rows = centres.astype(int).clip(0).T
+    cell_m = site.depth_m[rows, columns] * site.step / max(site.frame.camera.focal_px)
+    slant = site.depth_m[rows, columns] / site.camera_height_m
+    size_m = cell_m * np.maximum(
+        boxes[:, cv2.CC_STAT_WIDTH], slant * (boxes[:, cv2.CC_STAT_HEIGHT] - 1)
+    )
+    kept = (size_m > SHADOW_SIDE_M) & (boxes[:, cv2.CC_STAT_AREA] >= SHADOW_LEAST_CELLS)
+    # Name 0 is all that is not dark.
+    kept[0] = False
+    return kept.astype(np.uint8)[names]
+
+
 def _tint(site: Site, gain: Float32, ground: Bool) -> Float32:
-    """(3,) log gain of red, green and blue beside each unit of log gain: shadows lose their blue."""
+    """(3,) log gains of the colours beside each unit of log gain: shadows lose their blue."""
     classes, gain, light = site.small_classes[::3, ::3], gain[::3, ::3], site.light[::3, ::3]
     paved = ground[::3, ::3] & ((classes == ROAD) | (classes == SIDEWALK))
     shaded, is_lit = paved & (gain > SHADOW_DROP), paved & (np.abs(gain) < 0.2)
@@ -320,7 +321,9 @@ def _tint(site: Site, gain: Float32, ground: Bool) -> Float32:
         return np.zeros(3, np.float32)
     usual = np.median(_chroma(light[is_lit]), axis=0)
     tint = (usual - _chroma(light[shaded])) / gain[shaded][:, None]
-    return np.clip(np.median(tint, axis=0), -TINT_LIMIT, TINT_LIMIT).astype(np.float32)
+    # A shadow that is warmer than the light is none of the sun's.
+    bounds = np.array([[0.0, 0.0, -TINT_LIMIT], [TINT_LIMIT, 0.0, 0.0]])
+    return np.clip(np.median(tint, axis=0), *bounds).astype(np.float32)
 
 
 def _chroma(light: Float32) -> Float32:
@@ -338,21 +341,24 @@ def _contact(site: Site, ground: Bool) -> tuple[Float32, Float32]:
         standing &= site.small_classes != VEGETATION
         # The classes' own limit is as high as a bumper.
         standing |= (site.height_m > STANDING_M) & (site.depth_m < STANDING_RANGE_M)
-    if not standing.any():
-        return np.ones(site.shape, np.float32), np.zeros(site.shape, np.float32)
-    _, nearest = cv2.distanceTransformWithLabels(
-        (~standing).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    rows, columns = np.nonzero(standing)
-    down = np.arange(site.shape[0])[:, None] - rows.astype(np.float32)[nearest - 1]
-    across = np.arange(site.shape[1]) - columns.astype(np.float32)[nearest - 1]
-    focal_cells = max(site.frame.camera.focal_px) / site.step
-    depth = np.where(ground, site.depth_m, 1.0)
-    # A cell down the picture is a longer way on the ground than one across it.
-    slant = depth / site.camera_height_m
-    distance = np.hypot(across, down * slant) * depth / focal_cells
-    shade = np.where(ground, np.exp(-distance / CONTACT_M), 0.0).astype(np.float32)
-    return 1 - shade, np.log1p(-CONTACT_DARKENING * shade)
+    shade = np.zeros(site.shape, np.float32)
+    # Above the first ground there is none to shade.
+    top = int(np.argmax(ground.any(axis=1)))
+    standing, depth = standing[top:], np.where(ground, site.depth_m, np.float32(1.0))[top:]
+    if standing.any():
+        _, nearest = cv2.distanceTransformWithLabels(
+            (~standing).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        rows, columns = (places.astype(np.float32)[nearest - 1] for places in np.nonzero(standing))
+        across = np.arange(site.shape[1], dtype=np.float32) - columns
+        # A cell down the picture is a longer way on the ground than one across it.
+        down = np.arange(len(depth), dtype=np.float32)[:, None] - rows
+        down *= depth / np.float32(site.camera_height_m)
+        cell_m = depth * np.float32(site.step / max(site.frame.camera.focal_px))
+        # Not so far that shade becomes a denormal number, which is slow.
+        distance_m = np.minimum(np.sqrt(across * across + down * down) * cell_m, FARTHEST_M)
+        shade[top:] = np.where(ground[top:], np.exp(distance_m / np.float32(-CONTACT_M)), 0.0)
+    return 1 - shade, np.log1p(-np.float32(CONTACT_DARKENING) * shade)
 
 
 def _object_gain(site: Site, luma: Float32, level: Float32) -> Float32:
@@ -379,18 +385,16 @@ def _mixed(colours: Float32, weights: Any) -> Float32:
 
 def _srgb(site: Site) -> Float32:
     """(h, w, 3) means of the cells' sRGB values, in [0, 1]."""
-    return _area(site.frame.image, site.step) * np.float32(1 / 255)
+    return _area(site.frame.image, site.step)
 
 
 def _area(plane: NDArray[np.uint8], step: int) -> Float32:
-    """Means (h, w, ...) float32 of the cells of a plane (H, W, ...)."""
+    """Means (h, w, ...) in [0, 1] of the cells of a plane of levels (H, W, ...)."""
     height, width = plane.shape[:2]
     rows, columns = -(-height // step), -(-width // step)
     if (rows * step, columns * step) != (height, width):
         plane = cv2.copyMakeBorder(
             plane, 0, rows * step - height, 0, columns * step - width, cv2.BORDER_REPLICATE
         )
-    if plane.ndim == 2:
-        plane = plane * np.uint8(255)
-        return cv2.resize(plane, (columns, rows), interpolation=cv2.INTER_AREA) / np.float32(255)
-    return cv2.resize(plane, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.float32)
+    means = cv2.resize(plane, (columns, rows), interpolation=cv2.INTER_AREA)
+    return means.astype(np.float32) * np.float32(1 / 255)

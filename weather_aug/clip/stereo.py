@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from weather_aug._checks import finite, image_uint8, like_image
 from weather_aug._compiled import compiled
 from weather_aug.clip.completion import completed, sharpened
+from weather_aug.clip.edges import OtherView, refined
+from weather_aug.clip.posts import post_disparity
 from weather_aug.clip.sky import sky_mask, texture
 from weather_aug.errors import ArgumentError
 from weather_aug.taxonomy import SKY
@@ -25,6 +27,11 @@ GUESS_CONFIDENCE = 0.02
 MIN_DISPARITY_PX = 0.4
 MIN_DEPTH_M = 2.5
 MIN_TEXTURE = 6.0
+MIN_JUMP_PX = 1.5
+EDGE_REACH_PX = 10
+MATCH_BELIEF = 0.33
+ISLAND_SHARE = 2e-3
+ISLAND_GREY_LEVELS = 20.0
 
 
 class Disparity(NamedTuple):
@@ -78,16 +85,33 @@ def stereo_depth(
     else:
         like_image("label", label, left.shape[:2])
         sky = label == SKY
-    trusted = match.trusted & ~sky
-    filled, hidden = _from_background(match.disparity_px, trusted)
-    values = np.where(trusted, match.disparity_px, filled)
+    posts = post_disparity(left, right, max_disparity_px=reach_px)
+    # A post that is no nearer than what was matched there is drawn on it.
+    posts[posts < np.where(match.trusted & ~sky, match.disparity_px + MIN_JUMP_PX, 0)] = 0
+    if label is None:
+        sky &= posts < MIN_JUMP_PX
+        sky &= ~_nearer_islands(sky, match, left, right)
+    matched_px = np.where(posts > 0, posts, match.disparity_px)
+    trusted = (match.trusted | (posts > 0)) & ~sky
+    filled, hidden = _from_background(matched_px, trusted)
+    values = np.where(trusted, matched_px, filled)
     guessed = np.where(hidden, HIDDEN_CONFIDENCE, GUESS_CONFIDENCE)
     confidence = np.where(trusted, 1.0, guessed).astype(np.float32)
     confidence[sky | (values <= 0)] = 0
     smooth = completed(values, confidence, left, barrier=sky, stiffness=4.0)
-    sharp = sharpened(smooth, min_jump=1.5)
+    sharp = sharpened(smooth, min_jump=MIN_JUMP_PX)
     depth = focal_px * baseline_m / np.maximum(sharp, MIN_DISPARITY_PX)
-    return np.where(sky, np.inf, depth).astype(np.float32)
+    depth = np.where(sky, np.inf, depth).astype(np.float32)
+    belief = np.where(posts > 0, 1, np.where(sky | trusted | hidden, MATCH_BELIEF, 0))
+    return refined(
+        depth,
+        left,
+        label=label,
+        confidence=belief.astype(np.float32),
+        other_view=OtherView(right, focal_px * baseline_m),
+        min_jump_per_m=MIN_JUMP_PX / (focal_px * baseline_m),
+        reach_px=EDGE_REACH_PX,
+    )
 
 
 def right_depth(
@@ -151,6 +175,35 @@ def _matched(left: NDArray[np.uint8], right: NDArray[np.uint8], count: int) -> F
     ]
     sixteenths = matcher.compute(*wide)[:, count:]
     return sixteenths.astype(np.float32) / 16
+
+
+def _nearer_islands(
+    sky: NDArray[np.bool_],
+    match: Disparity,
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+) -> NDArray[np.bool_]:
+    """Small pieces of sky that the right picture shows where a near thing would be: white signs."""
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(sky.astype(np.uint8))
+    small = stats[:, cv2.CC_STAT_AREA] < ISLAND_SHARE * sky.size
+    small[0] = False
+    numbered = cv2.dilate(np.where(small[parts], parts, 0).astype(np.float32), np.ones((7, 7)))
+    part = numbered.astype(np.int32)
+    rim = (part > 0) & match.trusted & ~sky
+    matched = np.bincount(part[rim], minlength=count)
+    around = np.bincount(part[rim], match.disparity_px[rim], count) / np.maximum(matched, 1)
+    # With its rim, for a piece of one colour matches anywhere within itself.
+    rows, columns = np.nonzero(part > 0)
+    piece = part[rows, columns]
+    off_px = np.rint(around[piece]).astype(np.int64)
+    here = left[rows, columns].astype(np.int32)
+    as_far = np.abs(here - right[rows, columns]).sum(axis=1)
+    as_near = np.abs(here - right[rows, np.maximum(columns - off_px, 0)]).sum(axis=1)
+    better = np.bincount(piece, as_far - as_near, count) / np.maximum(
+        np.bincount(piece, minlength=count), 1
+    )
+    nearer = small & (better > ISLAND_GREY_LEVELS) & (matched > 0)
+    return np.asarray(nearer[parts] & sky)
 
 
 def _dense(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -30,6 +30,8 @@ MIN_TEXTURE = 6.0
 MIN_JUMP_PX = 1.5
 EDGE_REACH_PX = 10
 MATCH_BELIEF = 0.33
+BLUE_GREY_LEVELS = 35
+HIGH_SHARE = 0.9
 ISLAND_SHARE = 2e-3
 ISLAND_GREY_LEVELS = 20.0
 
@@ -81,7 +83,9 @@ def stereo_depth(
         # White walls look like sky; matches nearer than 100 m say otherwise, but only where there
         # is something to match: empty sky gives consistent nonsense.
         near = match.trusted & (match.disparity_px > focal_px * baseline_m / 100.0)
-        sky = sky_mask(left) & ~_dense(near & (texture(left) > MIN_TEXTURE))
+        looks = sky_mask(left)
+        gaps = _blue_gaps(looks, left)
+        sky = looks & (gaps | ~_dense(near & (texture(left) > MIN_TEXTURE)))
     else:
         like_image("label", label, left.shape[:2])
         sky = label == SKY
@@ -90,7 +94,7 @@ def stereo_depth(
     posts[posts < np.where(match.trusted & ~sky, match.disparity_px + MIN_JUMP_PX, 0)] = 0
     if label is None:
         sky &= posts < MIN_JUMP_PX
-        sky &= ~_nearer_islands(sky, match, left, right)
+        sky &= gaps | ~_nearer_islands(sky, match, left, right)
     matched_px = np.where(posts > 0, posts, match.disparity_px)
     trusted = (match.trusted | (posts > 0)) & ~sky
     filled, hidden = _from_background(matched_px, trusted)
@@ -101,13 +105,13 @@ def stereo_depth(
     smooth = completed(values, confidence, left, barrier=sky, stiffness=4.0)
     sharp = sharpened(smooth, min_jump=MIN_JUMP_PX)
     depth = focal_px * baseline_m / np.maximum(sharp, MIN_DISPARITY_PX)
-    depth = np.where(sky, np.inf, depth).astype(np.float32)
+    dense = np.where(sky, np.inf, depth).astype(np.float32)
     belief = np.where(posts > 0, 1, np.where(sky | trusted | hidden, MATCH_BELIEF, 0))
     return refined(
-        depth,
+        dense,
         left,
         label=label,
-        confidence=belief.astype(np.float32),
+        confidence=np.asarray(belief, np.float32),
         other_view=OtherView(right, focal_px * baseline_m),
         min_jump_per_m=MIN_JUMP_PX / (focal_px * baseline_m),
         reach_px=EDGE_REACH_PX,
@@ -175,6 +179,17 @@ def _matched(left: NDArray[np.uint8], right: NDArray[np.uint8], count: int) -> F
     ]
     sixteenths = matcher.compute(*wide)[:, count:]
     return sixteenths.astype(np.float32) / 16
+
+
+def _blue_gaps(sky: NDArray[np.bool_], image: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Sky of a colour that is nothing but sky: blue, and as high as most of the sky.
+
+    Matching cannot contradict it: a gap between leaves moves with the leaves.
+    """
+    blue = image[..., 2].astype(np.int16) - image[..., 0] > BLUE_GREY_LEVELS
+    lowest = np.searchsorted(np.cumsum(sky.sum(axis=1)), HIGH_SHARE * sky.sum())
+    high = np.arange(len(sky))[:, None] < lowest
+    return np.asarray(sky & blue & high)
 
 
 def _nearer_islands(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from weather_aug.clip import posts
+from weather_aug.clip import posts, stereo
 from weather_aug.clip.posts import post_disparity, upright
 from weather_aug.clip.stereo import stereo_depth
 
@@ -91,3 +91,22 @@ def test_stereo_keeps_a_post_before_the_sky(sky: Pair) -> None:
     at_post = depth[30:84, POST[1]]
     assert (np.abs(at_post - 150.0 / POST_PX) < 1.0).mean() > 0.9
     assert np.isinf(depth[30:80, 40:90]).mean() > 0.99
+
+
+def test_a_post_nearer_than_the_ground_below_it_is_a_false_match(
+    sky: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left, right = (view.copy() for view in sky)
+    ground = cv2.GaussianBlur(
+        np.random.default_rng(3).integers(0, 160, (30, WIDTH + 30, 3), dtype=np.uint8), (0, 0), 1.0
+    )
+    left[-30:], right[-30:] = ground[:, :WIDTH], ground[:, 6 : WIDTH + 6]
+    false = np.zeros((HEIGHT, WIDTH), np.float32)
+    # At a place where nothing stands; 40 px would be nearer than the ground's 6 px.
+    false[40:80, 150:152] = 40.0
+    monkeypatch.setattr(stereo, "post_disparity", lambda *views, **limits: false.copy())
+    here = (slice(40, 80), slice(150, 152))
+    assert np.isinf(stereo_depth(left, right, focal_px=300.0, baseline_m=0.5)[here]).all()
+    nearest = np.full((HEIGHT, WIDTH), 99, np.float32)
+    monkeypatch.setattr(stereo, "_nearest_below", lambda match: nearest)
+    assert np.isfinite(stereo_depth(left, right, focal_px=300.0, baseline_m=0.5)[here]).any()

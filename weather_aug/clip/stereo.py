@@ -92,6 +92,7 @@ def stereo_depth(
     posts = post_disparity(left, right, max_disparity_px=reach_px)
     # A post that is no nearer than what was matched there is drawn on it.
     posts[posts < np.where(match.trusted & ~sky, match.disparity_px + MIN_JUMP_PX, 0)] = 0
+    posts[posts > _nearest_below(match) + MIN_JUMP_PX] = 0
     if label is None:
         sky &= posts < MIN_JUMP_PX
         sky &= gaps | ~_nearer_islands(sky, match, left, right)
@@ -179,6 +180,13 @@ def _matched(left: NDArray[np.uint8], right: NDArray[np.uint8], count: int) -> F
     ]
     sixteenths = matcher.compute(*wide)[:, count:]
     return sixteenths.astype(np.float32) / 16
+
+
+def _nearest_below(match: Disparity) -> Float32:
+    """Greatest disparity in a column at or below each row: what stands there is no nearer."""
+    known = np.where(match.trusted, match.disparity_px, 0).astype(np.float32)
+    steady = cv2.dilate(cv2.medianBlur(known, 5), np.ones((1, 9), np.uint8))
+    return np.asarray(np.maximum.accumulate(steady[::-1], axis=0)[::-1], np.float32)
 
 
 def _blue_gaps(sky: NDArray[np.bool_], image: NDArray[np.uint8]) -> NDArray[np.bool_]:

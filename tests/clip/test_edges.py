@@ -157,7 +157,7 @@ def test_lone_pixels_are_no_surface() -> None:
     speckled[40, 45] = 1 / FAR_M
     line = speckled.copy()
     line[:, 80] = 1 / NEAR_M
-    clean = edges._unspecked(line, near, far)
+    clean = edges.unspecked(line, near, far)
     assert clean[5, 5] == far[0, 0] and clean[40, 45] == near[0, 0]
     np.testing.assert_array_equal(line[1:-1, 80], clean[1:-1, 80])
     assert image.shape[:2] == clean.shape

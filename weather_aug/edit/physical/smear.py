@@ -64,9 +64,9 @@ def smear(ends, twice, spread, view, slope, out):
         for j in range(width):
             x, y, climb = ray_at(np.float32(row), np.float32(j), view)
             sine = max(-climb, np.float32(0.0)) / np.sqrt(x * x + y * y + np.float32(1.0))
-            sigma = np.float32(2.0) * slope * view.fy * spread[row, j]
-            radii[j] = _radius(sine * sigma)
-            _tent(ends[j], twice[:, j], row, _radius(sigma), down[j])
+            sigma_rad = np.float32(2.0) * slope * spread[row, j]
+            radii[j] = _radius(sine * sigma_rad * view.fx)
+            _tent(ends[j], twice[:, j], row, _radius(sigma_rad * view.fy), down[j])
             known += climb < np.float32(0.0)
         if known == 0:
             break

@@ -25,7 +25,7 @@ BAND_M = 1.0
 
 @dataclass(frozen=True)
 class Scene:
-    """A camera over the plane z = slope * x, turned by pitch and roll."""
+    """A camera over the plane z = 0, turned by pitch and roll."""
 
     pitch_deg: float = 0.0
     roll_deg: float = 0.0

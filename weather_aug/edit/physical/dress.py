@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from weather_aug._compiled import compiled
+from weather_aug._compiled import compiled, inlined
 from weather_aug._rows import encode_row, survival
 from weather_aug.edit.physical.ground_rows import ground_run
 from weather_aug.edit.physical.materials import CAP_M, COVER, GROUND, LEAF, POROSITY
+from weather_aug.edit.physical.relight import LEAST_GAIN, MOST_GAIN, SKY_FEATURE
 from weather_aug.edit.physical.spread import spread_run
 from weather_aug.edit.physical.standing_rows import caps_row, film_run, standing_run
 from weather_aug.edit.surface import depth_row, light_row
@@ -26,14 +27,17 @@ R, G, B, LUMA = range(4)
 """Rows of the buffer: linear light, and the recorded picture's sRGB luma."""
 BELOW_TOP, DEPTH_ABOVE = 4, 5
 """How far below its own upper edge a pixel lies, metres; depth of the pixel above it."""
-FREE = 6
+SKYNESS = 6
+"""The recorded picture's feature of the sky."""
+FREE = 7
 """First row that the runs may use."""
 BUFFER_ROWS = 24
 
-FLATTEN, MATTE, LIGHT, MEAN, LEVEL_MAP, LATERAL, SHARP, ROUGH = 0, 2, 4, 5, 6, 7, 8, 11
-"""Where the kernel's maps are in their stack; colours are three, the others one, FLATTEN and MATTE
-a slope and an offset of luma."""
-MAPS = 14
+GROUND_GAIN, OBJECT_GAIN, MATTE, LIGHT = 0, 4, 6, 8
+SHARP, MAPS = 12, 18
+"""Where the kernel's maps are in their stack: those of `layers`, but what is mirrored is three
+colours under the weather's light, twice."""
+OBJECT_GAINS = (np.float32(LEAST_GAIN), np.float32(MOST_GAIN))
 
 
 class Geometry(NamedTuple):
@@ -59,10 +63,14 @@ class Geometry(NamedTuple):
     left_0: np.float32
     height_0: np.float32
     """Over the road's plane, metres."""
+    labelled: np.float32
+    """1 where somebody said what is ground, 0 where it was guessed."""
 
 
 @compiled
-def dress(surface, classes, window, geometry, look, curve, matrix, table, maps, step, tile, out):
+def dress(
+    surface, classes, window, geometry, look, tint, curve, matrix, table, maps, step, tile, out
+):
     """Paint one window's background in the weather.
 
     Args:
@@ -71,10 +79,11 @@ def dress(surface, classes, window, geometry, look, curve, matrix, table, maps, 
         window: (top, left, height, width) in the whole picture.
         geometry: Camera of the whole picture.
         look: Weather.
+        tint: (3,) float32 of the ground's gain.
         curve: (256,) float32 toned light by sRGB level.
         matrix: (3, 3) float32 colour matrix after it.
         table: (256, 8) float32 materials.
-        maps: (14, h, w) float32 on the small grid of the whole picture.
+        maps: (18, h, w) float32 on the small grid of the whole picture.
         step: Pixels of a cell, float32.
         tile: Noise.
         out: (3, H, W) uint8 out.
@@ -97,11 +106,10 @@ def dress(surface, classes, window, geometry, look, curve, matrix, table, maps, 
     wet = (look.film > zero) | (look.mirror > zero)
     start = max(top - CAP_ROWS, 0) if look.snow > zero else top
     for y in range(start, top + height):
-        if y < top or snowy or wet:
-            depth_row(surface, y, left, bits, depth)
-            first = y * surface.width + left
-            for x in range(width):
-                kinds[x] = classes[first + x]
+        depth_row(surface, y, left, bits, depth)
+        first = y * surface.width + left
+        for x in range(width):
+            kinds[x] = classes[first + x]
         if look.snow > zero:
             caps_row(kinds, depth, geometry.fy, b, class_above)
         if y < top:
@@ -109,7 +117,9 @@ def dress(surface, classes, window, geometry, look, curve, matrix, table, maps, 
         has_sky = _small_row(maps, y, step, small)
         light_row(surface, y, left, curve, b[R, :width], b[G, :width], b[B, :width])
         luma_row(surface, y, left, b)
-        _tone(small, cell, share, look, matrix, width, b)
+        if look.flattening > zero:
+            _flatten(kinds, table, small, cell, share, look, tint, width, b)
+        _tone(look.exposure, matrix, width, b)
         if snowy or wet:
             x0 = 0
             while x0 < width:
@@ -168,7 +178,7 @@ def _small_row(maps, y, step, small):
 
 @compiled
 def luma_row(surface, y, left, b):
-    """The recorded picture's sRGB luma in [0, 1]."""
+    """The recorded picture's sRGB luma and its feature of the sky."""
     top_, left_, _, stride = surface.image_window
     start = (y - top_) * stride + left - left_
     width = b.shape[1] - 16
@@ -179,18 +189,59 @@ def luma_row(surface, y, left, b):
             + np.float32(0.7152 / 255) * np.float32(image[x, 1])
             + np.float32(0.0722 / 255) * np.float32(image[x, 2])
         )
+    red, blue = np.float32(SKY_FEATURE[0] / 255), np.float32(SKY_FEATURE[2] / 255)
+    for x in range(width):
+        b[SKYNESS, x] = red * np.float32(image[x, 0]) + blue * np.float32(image[x, 2])
 
 
 @compiled
-def _tone(small, cell, share, look, matrix, width, b):
-    """The sun's light and shadow go, then saturation and white."""
-    spread_run(small, FLATTEN, 2, cell, share, 0, width, b, FREE)
-    for x in range(width):
+def _flatten(kinds, table, small, cell, share, look, tint, width, b):
+    """The sun's light and shadow go, by runs of ground and of what stands."""
+    x0 = 0
+    while x0 < width:
+        ground = table[kinds[x0], GROUND] > np.float32(0.0)
+        x1 = x0 + 1
+        while x1 < width and (table[kinds[x1], GROUND] > np.float32(0.0)) == ground:
+            x1 += 1
+        if ground:
+            spread_run(small, GROUND_GAIN, 4, cell, share, x0, x1, b, FREE)
+            _ground_gain(x0, x1, look.flattening, tint, b)
+        else:
+            spread_run(small, OBJECT_GAIN, 2, cell, share, x0, x1, b, FREE)
+            _object_gain(x0, x1, look.flattening, b)
+        x0 = x1
+
+
+@inlined
+def _ground_gain(x0, x1, strength, tint, b):
+    zero = np.float32(0.0)
+    for x in range(x0, x1):
         gain = b[FREE, x] * b[LUMA, x] + b[FREE + 1, x]
-        b[FREE, x] = survival(-look.flattening * gain) * look.exposure
+        gain = max(gain, b[FREE + 2, x])
+        b[FREE, x] = strength * min(gain, b[FREE + 3, x])
+    for channel in range(3):
+        for x in range(x0, x1):
+            gain = b[FREE, x]
+            gain += tint[channel] * max(gain, zero)
+            b[channel, x] *= survival(-gain)
+
+
+@inlined
+def _object_gain(x0, x1, strength, b):
+    least, most = OBJECT_GAINS
+    for x in range(x0, x1):
+        gain = b[FREE, x] * b[LUMA, x] + b[FREE + 1, x]
+        b[FREE, x] = survival(-strength * min(max(gain, least), most))
+    for channel in range(3):
+        for x in range(x0, x1):
+            b[channel, x] *= b[FREE, x]
+
+
+@compiled
+def _tone(exposure, matrix, width, b):
+    """Saturation and white."""
     for x in range(width):
-        gain = b[FREE, x]
-        r, g, v = b[R, x] * gain, b[G, x] * gain, b[B, x] * gain
+        r, g, v = b[R, x] * exposure, b[G, x] * exposure, b[B, x] * exposure
         b[R, x] = matrix[0, 0] * r + matrix[0, 1] * g + matrix[0, 2] * v
         b[G, x] = matrix[1, 0] * r + matrix[1, 1] * g + matrix[1, 2] * v
         b[B, x] = matrix[2, 0] * r + matrix[2, 1] * g + matrix[2, 2] * v
@@ -205,7 +256,7 @@ def _sky(small, cell, share, left, y, geometry, look, width, b):
     rise = geometry.climb_y * ray_y + geometry.climb_z
     across = one + ray_y * ray_y
     for x in range(width):
-        matte = b[FREE, x] * b[LUMA, x] + b[FREE + 1, x]
+        matte = b[FREE, x] * b[SKYNESS, x] + b[FREE + 1, x]
         matte = min(max(matte, zero), one)
         weight = look.sky * matte
         ray_x = (np.float32(left + x) - geometry.cx) / geometry.fx

@@ -18,7 +18,7 @@ from weather_aug.edit.physical.layers import Layers
 from weather_aug.edit.physical.look import Look, look_of
 from weather_aug.edit.physical.materials import material_table
 from weather_aug.edit.physical.noise import PERIOD_M, noise_tile
-from weather_aug.edit.physical.overcast import MEAN_SKY_GAIN, tone
+from weather_aug.edit.physical.overcast import tone
 from weather_aug.edit.surface import surface_of
 from weather_aug.weather import Weather
 
@@ -56,17 +56,19 @@ def edited(
     """
     look = look_of(weather, ambience, layers.illumination, without)
     curve, matrix = tone(0.0 if "relight" in without else weather.overcast)
+    labelled = frame.label is not None
     _, _, height, width = window
     out = np.empty((3, height, width), np.uint8)
     dress(
         surface_of(frame),
         layers.classes.reshape(-1),
         window,
-        geometry_of(frame.camera, ambience.axes_world, layers.plane),
+        geometry_of(frame.camera, ambience.axes_world, layers.plane, labelled=labelled),
         look,
+        layers.tint,
         curve.astype(np.float32),
         matrix.astype(np.float32),
-        material_table(labelled=frame.label is not None),
+        material_table(labelled=labelled),
         maps_in(layers, window, look, curve, matrix),
         np.float32(layers.step),
         noise_tile(),
@@ -76,14 +78,17 @@ def edited(
     return image
 
 
-def geometry_of(camera: Camera, axes_world: Float64, plane: Float64) -> Geometry:
+def geometry_of(camera: Camera, axes_world: Float64, plane: Float64, *, labelled: bool) -> Geometry:
     """What the kernels know of a camera over the road's plane; see `Site.plane`."""
     rays = axes_world @ camera.world_from_camera[:3, :3]
     origin = axes_world @ camera.centre_world
     climb = np.array([-plane[1], -plane[2], 1.0]) @ rays
     height_m = origin[2] - plane[0] - plane[1:] @ origin[:2]
     places = np.mod(origin[:2], PERIOD_M)
-    values = (*camera.focal_px, *camera.principal_px, *rays[0], *rays[1], *climb, *places, height_m)
+    values = (
+        *(*camera.focal_px, *camera.principal_px, *rays[0], *rays[1]),
+        *(*climb, *places, height_m, float(labelled)),
+    )
     return Geometry(*(np.float32(value) for value in values))
 
 
@@ -95,13 +100,13 @@ def maps_in(layers: Layers, window: Window, look: Look, curve: Float64, matrix: 
     last = min(int((top + height) / layers.step) + 2, rows)
     root = np.linspace(0.0, 1.0, TABLE_STEPS)
     table = np.interp(root**2, SRGB_LEVELS_LINEAR, curve).astype(np.float32)
-    sky = MEAN_SKY_GAIN * np.array([look.red, look.green, look.blue])
+    horizon = np.array([look.red, look.green, look.blue])
     out = np.zeros((MAPS, *layers.maps.shape[1:]), np.float32)
     _under_tone(
         layers.maps[:, first:last].astype(np.float32),
         table,
         (matrix * look.exposure).astype(np.float32),
-        sky.astype(np.float32),
+        horizon,
         look.mirror > 0,
         first,
         out,
@@ -112,7 +117,7 @@ def maps_in(layers: Layers, window: Window, look: Look, curve: Float64, matrix: 
 @compiled
 def _under_tone(maps, table, matrix, sky, mirrors, first, out):
     """Copy geometry; take light through the tone; put the weather's sky into what is mirrored."""
-    one = np.float32(1.0)
+    zero, one = np.float32(0.0), np.float32(1.0)
     for row in range(maps.shape[1]):
         for column in range(maps.shape[2]):
             for k in range(SHARP):
@@ -123,14 +128,16 @@ def _under_tone(maps, table, matrix, sky, mirrors, first, out):
                 continue
             for kind in range(2):
                 base = SHARP_LAYER + 4 * kind
-                surfaces = one - maps[base + 3, row, column]
-                share = max(surfaces, np.float32(1e-3))
+                horizons = maps[base + 3, row, column]
+                surfaces = one - horizons
+                surfaces = max(surfaces, zero)
+                share = max(surfaces, np.float32(1e-2))
                 r = _toned(maps[base, row, column] / share, table)
                 g = _toned(maps[base + 1, row, column] / share, table)
                 b = _toned(maps[base + 2, row, column] / share, table)
                 for channel in range(3):
                     value = matrix[channel, 0] * r + matrix[channel, 1] * g + matrix[channel, 2] * b
-                    mixed = surfaces * value + (one - surfaces) * sky[channel]
+                    mixed = surfaces * value + horizons * sky[channel]
                     out[SHARP + 3 * kind + channel, first + row, column] = mixed
 
 

@@ -5,20 +5,21 @@ from __future__ import annotations
 import numpy as np
 
 from weather_aug._compiled import inlined
+from weather_aug.edit.physical.fresnel import film_ratio_of, fresnel_of_sine
 from weather_aug.edit.physical.materials import COVER, MIRROR, POROSITY, ROAD
 from weather_aug.edit.physical.noise import ground_noise
 from weather_aug.edit.physical.spread import spread_run
 
 R, G, B = range(3)
-LIGHT, LATERAL, SHARP, ROUGH = 4, 7, 8, 11
-ALONG, LEFT, SINE, SIZE, NOISE, LIT, SIDE, COVERED, POOL, MIRRORED = *range(6, 15), 15
+LIGHT, LATERAL, SHARP = 8, 11, 12
+ALONG, LEFT, SINE, SIZE, NOISE, LIT, SIDE, POOL, COVERED, MIRRORED = range(7, 17)
 """Rows of the buffer that a run uses; the mirrored light takes six from MIRRORED on."""
 
 LANE_M, WHEEL_M, TRACK_M = 3.5, 0.75, 0.28
 """Width of a lane, wheels from its middle, half the width of a track."""
 SNOW_ALBEDO, ASPHALT_ALBEDO = 0.85, 0.12
-FILM_OUT, FILM_BACK = 0.066, 0.475
-"""Share of light that a film of water turns back from above, and from below (n = 1.333)."""
+GUESSED_HEIGHTS = (0.05, 0.20)
+"""Over the road's plane, metres: where nobody labelled, what rises from it mirrors less."""
 MICRO_SLOPE = 0.25
 """Root mean square slope of the stones that stick out of a film, radians."""
 
@@ -38,21 +39,6 @@ def covered(amount, fuzz, noise):
     one = np.float32(1.0)
     threshold = one + fuzz - amount * (one + np.float32(2.0) * fuzz)
     return ramp(threshold - fuzz, threshold + fuzz, noise)
-
-
-@inlined
-def fresnel_of_sine(s):
-    one = np.float32(1.0)
-    t = one - s
-    return np.float32(0.02) + np.float32(0.98) * t * t * t * t * t
-
-
-@inlined
-def film_ratio(albedo):
-    """Albedo under a film of water over the dry one (Lekner and Dorf 1988)."""
-    one = np.float32(1.0)
-    through = (one - np.float32(FILM_OUT)) * (one - np.float32(FILM_BACK))
-    return through / (one - np.float32(FILM_BACK) * albedo)
 
 
 @inlined
@@ -96,7 +82,8 @@ def ground_run(run, depth, geometry, look, material, small, cell, share, tile, b
         else:
             for x in range(x0, x1):
                 b[POOL, x] = zero
-        _mirror(x0, x1, shine, look.flooded, b)
+        _shine(run, depth, geometry, shine, b)
+        _mirror(x0, x1, look.flooded, b)
     if amount > zero:
         _cover(x0, x1, amount, b)
         _lay(x0, x1, look, b)
@@ -156,16 +143,30 @@ def film(x0, x1, wet, lit, b):
             albedo = value * bare
             albedo = albedo if albedo > least else least
             albedo = albedo if albedo < most else most
-            b[channel, x] = value * (one + wet * (film_ratio(albedo) - one))
+            b[channel, x] = value * (one + wet * (film_ratio_of(albedo) - one))
 
 
 @inlined
-def _mirror(x0, x1, shine, flooded_share, b):
+def _shine(run, depth, geometry, shine, b):
+    """How far each pixel's water mirrors; puddles lie where it does."""
+    x0, x1, left, y = run
+    low, high = GUESSED_HEIGHTS
+    ray_y = (np.float32(y) - geometry.cy) / geometry.fy
+    climb_y = geometry.climb_y * ray_y + geometry.climb_z
+    for x in range(x0, x1):
+        ray_x = (np.float32(left + x) - geometry.cx) / geometry.fx
+        height = geometry.height_0 + depth[x] * (geometry.climb_x * ray_x + climb_y)
+        level = np.float32(1.0) - ramp(np.float32(low), np.float32(high), height)
+        b[COVERED, x] = shine * (geometry.labelled + (np.float32(1.0) - geometry.labelled) * level)
+
+
+@inlined
+def _mirror(x0, x1, flooded_share, b):
     """What the film and the puddles mirror."""
     one = np.float32(1.0)
     slope2 = np.float32(MICRO_SLOPE * MICRO_SLOPE)
     for x in range(x0, x1):
-        sine, pool = b[SINE, x], b[POOL, x]
+        sine, pool, shine = b[SINE, x], b[POOL, x], b[COVERED, x]
         flooded = flooded_share + pool * (one - flooded_share)
         rough = fresnel_of_sine(np.sqrt(sine * sine + slope2))
         stones = shine * (one - flooded) * np.float32(0.5) * rough

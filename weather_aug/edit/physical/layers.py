@@ -13,25 +13,31 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from weather_aug.colour import LUMINANCE
-from weather_aug.edit.physical import settling
+from weather_aug.colour import LUMINANCE, srgb_from_linear
+from weather_aug.edit.physical import relight, settling
+from weather_aug.edit.physical.mirror import mirror_map, mirrored
+from weather_aug.edit.physical.overcast import ZENITH_GAIN
 from weather_aug.edit.physical.site import Site
-from weather_aug.taxonomy import ROAD, SKY
+from weather_aug.taxonomy import SKY
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 
 NAMES = (
-    *("flatten_slope", "flatten_offset", "matte_slope", "matte_offset"),
+    *("ground_slope", "ground_offset", "ground_least", "ground_most"),
+    *("object_slope", "object_offset", "matte_slope", "matte_offset"),
     *("illumination", "luminance", "facing_up", "lateral_m"),
     *("sharp_red", "sharp_green", "sharp_blue", "sharp_sky"),
     *("rough_red", "rough_green", "rough_blue", "rough_sky"),
 )
-FLATTEN_SLOPE, FLATTEN_OFFSET, MATTE_SLOPE, MATTE_OFFSET = range(4)
-ILLUMINATION, LUMINANCE_MEAN, FACING_UP, LATERAL_M = range(4, 8)
-SHARP, SHARP_SKY, ROUGH, ROUGH_SKY = 8, 11, 12, 15
-"""Colours are three maps each, of surfaces; what the sky adds is its share."""
+"""See `relight.Flattening`, `relight.sky_matte`, `relight.illumination`, `settling` and `mirror`.
+What is mirrored is the light of surfaces, as it is where they are mirrored and 0 where the sky is,
+and by how much of the horizon's light the sky is."""
+GROUND_GAIN, OBJECT_GAIN, MATTE = 0, 4, 6
+ILLUMINATION, LUMINANCE_MEAN, FACING_UP, LATERAL_M = range(8, 12)
+SHARP, ROUGH = 12, 16
+MEAN_CELLS = 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +46,9 @@ class Layers:
 
     step: float
     maps: NDArray[np.float16]
-    """(16, h, w), in the order of `NAMES`."""
+    """(20, h, w), in the order of `NAMES`."""
+    tint: Float32
+    """(3,) of `relight.Flattening`."""
     plane: Float64
     """(3,) of the road: up = plane[0] + plane[1] along + plane[2] left, street axes."""
     classes: UInt8
@@ -60,23 +68,35 @@ def layers_of(site: Site, path: Float64 | None = None) -> Layers:
         path: (P, 2) places of the camera in the order driven, street axes (along, left); None where
             nobody knows: the way then goes straight ahead.
     """
-    maps = np.zeros((len(NAMES), *site.shape), np.float32)
+    flat = relight.flattening(site)
+    lit = relight.illumination(site, flat)
+    mirror = mirror_map(site)
+    surfaces = np.where(site.small_classes[..., None] == SKY, 0.0, overcast_light(site, flat))
+    shown = mirrored(mirror, surfaces.astype(np.float32), np.zeros((2, 3)))
+    sky_gain = np.array([[1.0] * 3, [1.0 + ZENITH_GAIN] * 3])
+    free = mirrored(mirror, np.zeros_like(site.light), sky_gain)
     luminance = (site.light @ LUMINANCE).astype(np.float32)
-    maps[MATTE_OFFSET] = site.small_classes == SKY
-    road = luminance[site.small_classes == ROAD]
-    maps[ILLUMINATION] = np.median(road) / 0.12 if len(road) else 1.0
-    maps[LUMINANCE_MEAN] = cv2.blur(luminance, (9, 9))
-    maps[FACING_UP] = settling.facing_up(site)
-    maps[LATERAL_M] = settling.lateral_m(site, path)
-    # TODO: mirror
-    above = np.where(np.isfinite(site.depth_m)[..., None], site.light, 0)
-    sky = (~np.isfinite(site.depth_m)).astype(np.float32)
-    h = len(sky)
-    idx = np.clip(2 * int(h * 0.47) - np.arange(h), 0, h - 1)
-    for base, s, k in ((SHARP, SHARP_SKY, (1, 5)), (ROUGH, ROUGH_SKY, (3, 31))):
-        for c in range(3):
-            maps[base + c] = cv2.blur(above[idx][..., c].astype(np.float32), k)
-        maps[s] = cv2.blur(sky[idx], k)
-    stack = maps.astype(np.float16)
+    planes = (
+        *np.moveaxis(flat.ground, -1, 0),
+        *np.moveaxis(flat.objects, -1, 0),
+        *relight.sky_matte(site),
+        lit,
+        cv2.blur(luminance, (MEAN_CELLS, MEAN_CELLS)),
+        settling.facing_up(site),
+        settling.lateral_m(site, path),
+        *np.moveaxis(shown.sharp, -1, 0),
+        free.sharp[..., 0],
+        *np.moveaxis(shown.rough, -1, 0),
+        free.rough[..., 0],
+    )
+    stack = np.stack(planes).astype(np.float16)
     stack.flags.writeable = False
-    return Layers(float(site.step), stack, site.plane, site.classes)
+    return Layers(float(site.step), stack, flat.tint, site.plane, site.classes)
+
+
+def overcast_light(site: Site, flat: relight.Flattening) -> Float32:
+    """Linear light (h, w, 3) of what stands, without the sun's."""
+    luma = srgb_from_linear(np.clip(site.light, 0, 1)) @ LUMINANCE
+    slope, offset = flat.objects[..., 0], flat.objects[..., 1]
+    gain = np.clip(slope * luma + offset, relight.LEAST_GAIN, relight.MOST_GAIN)
+    return (site.light * np.exp(gain)[..., None]).astype(np.float32)

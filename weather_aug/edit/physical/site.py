@@ -141,8 +141,9 @@ def shrunk(image: UInt8, step: int) -> Float32:
 def street_rays(camera: Camera, axes_world: Float64, shape: tuple[int, int], step: int) -> Float32:
     """(h, w, 3) in street axes: the step of a surface's place for each metre of its depth."""
     (fx, fy), (cx, cy) = camera.focal_px, camera.principal_px
-    x = ((np.arange(shape[1]) + 0.5) * step - 0.5 - cx) / fx
-    y = ((np.arange(shape[0]) + 0.5) * step - 0.5 - cy) / fy
+    # Through the pixels that `_centres` takes: of an even step none lies at a cell's very centre.
+    x = (np.minimum(np.arange(shape[1]) * step + step // 2, camera.width - 1) - cx) / fx
+    y = (np.minimum(np.arange(shape[0]) * step + step // 2, camera.height - 1) - cy) / fy
     street_from_camera = axes_world @ camera.world_from_camera[:3, :3]
     across = x[None, :, None] * street_from_camera[:, 0]
     down = y[:, None, None] * street_from_camera[:, 1]

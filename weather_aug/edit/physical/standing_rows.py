@@ -19,8 +19,8 @@ from weather_aug.edit.physical.spread import spread_run
 
 R, G, B = range(3)
 BELOW_TOP, DEPTH_ABOVE = 4, 5
-LIGHT, MEAN, FACING_UP = 4, 5, 6
-LIT = 6
+LIGHT = 8
+LIT = 7
 """Row of the buffer for the light on a run, the mean luminance and how level it is follow."""
 
 NO_CAP_M = 99.0

@@ -244,6 +244,27 @@ def test_the_sky_stands_at_the_bottom_of_a_drop():
     assert lower_over_upper(-1.0) < 1 / 1.5
 
 
+def outline_is_cut(share):
+    """Whether drops change when the box they are drawn in is larger."""
+    storm = Weather(lens_drops=400.0)
+    camera = make_camera(SIZE[1], SIZE[0])
+    drops = landed(storm, camera=camera)
+    shots = []
+    for scale in (share, 2.0):
+        rows = drops.rows.copy()
+        rows[:, lens_drops.columns.SIZE] *= scale
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(lens, "drops_on", lambda *args, rows=rows: drops._replace(rows=rows))
+            shots.append(seen(storm).alpha)
+    return (shots[0] != shots[1]).any()
+
+
+def test_outlines_fit_into_their_boxes():
+    assert not outline_is_cut(1.0)
+    # Planted fault.
+    assert outline_is_cut(0.7)
+
+
 def steepest(aperture_m):
     camera = make_camera(SIZE[1], SIZE[0], 200.0, aperture_m=aperture_m)
     alpha = seen(camera=camera, veil=False, time_s=4.0).alpha

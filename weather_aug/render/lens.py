@@ -23,6 +23,7 @@ from weather_aug.render.lens_refraction import draw_drops, fill_pyramid
 from weather_aug.render.lens_wiper import (
     BLADE_M,
     BLADE_M_PER_S,
+    DULL_EXPOSURE_S,
     GLASS_M,
     Wiper,
     confusion_px,
@@ -187,12 +188,13 @@ def _wiped(
     if wiper.blade is None:
         return
     dark = (_BLADE_LIGHT * mean + scene.veil).astype(np.float32)
+    exposure_s = max(camera.exposure_s, DULL_EXPOSURE_S)
     widths = (
         np.float32(wiper.blade),
         pivot,
         np.float32(wiper.outer_px),
         np.float32(BLADE_M * camera.focal_px[0] / GLASS_M),
-        np.float32(BLADE_M_PER_S * camera.exposure_s * camera.focal_px[0] / GLASS_M),
+        np.float32(BLADE_M_PER_S * exposure_s * camera.focal_px[0] / GLASS_M),
         np.float32(np.hypot(confusion_px(camera), 1.5)),
     )
     draw_blade(*widths, dark, scene.window, *_curves(), image, alpha, hidden)

@@ -14,7 +14,7 @@ from weather_aug._keys import key_of
 from weather_aug.clip.types import Camera
 from weather_aug.particles.kernels import GOLDEN, mix64
 from weather_aug.render import lens_refraction as columns
-from weather_aug.render.lens_refraction import COLUMNS, DISCS
+from weather_aug.render.lens_refraction import COLUMNS, DISCS, MERGE
 from weather_aug.render.lens_wiper import GLASS_M, Wiper, confusion_px
 from weather_aug.weather import Weather
 
@@ -31,6 +31,8 @@ SLOTS = 4096
 """Places for drops; many, so that the count is nearly Poisson."""
 MEDIAN_RADIUS, SPREAD = 0.008, 0.5
 """Median of the drops' radii over the picture's width, and standard deviation of its logarithm."""
+MAIN_DISC = 0.75
+"""Radius of a drop's main disc over the drop's: merged ones make up for the rest."""
 STRETCH = 1.2
 OPACITY_RANGE = (0.55, 0.9)
 CONTACT_RAD = (0.35, 0.87)
@@ -58,7 +60,7 @@ class Drops(NamedTuple):
     places_px: Float64
     """(N, 2) centres, (x, y) in the picture's pixels."""
     radii_px: Float64
-    """(N,) of the discs they are made of."""
+    """(N,) of their main discs."""
     rows: Float32
     """(M, COLUMNS) what the kernel draws: the drops, and what runners leave behind."""
 
@@ -82,13 +84,50 @@ def drops_on(
     chance = weather.lens_drops / (SLOTS * share_alive * share_inside)
     found = np.empty((SLOTS, 3 + DRAWS))
     found = found[: alive(key, time_s, chance, SLOTS, found)]
-    landed = _placed(found, camera)
-    if wiper is None or not len(found):
-        return landed
-    here, there = landed.places_px, _landing_px(found, camera)
-    gone = wiper.cleared(here[:, 0], here[:, 1], landed.ages_s)
-    gone |= wiper.cleared(there[:, 0], there[:, 1], landed.ages_s)
-    return _placed(found[~gone], camera)
+    motion = _motion_of(found, camera)
+    if wiper is not None and len(found):
+        here, there = motion.places_px, _landing_px(found, camera)
+        gone = wiper.cleared(here[:, 0], here[:, 1], found[:, 1])
+        gone |= wiper.cleared(there[:, 0], there[:, 1], found[:, 1])
+        found, motion = found[~gone], _Motion(*(values[~gone] for values in motion))
+    bodies = _bodies(found, motion, camera)
+    radius = bodies[:, columns.RADIUS]
+    ran = np.abs(motion.slid_px) > radius
+    left = _left_behind(bodies[ran], motion.slid_px[ran], found[ran, 3:])
+    # A runner's tail lies under it.
+    rows = _finished(np.concatenate([left, bodies]), camera)
+    return Drops(found[:, 0].astype(np.int64), found[:, 1], motion.places_px, radius, rows)
+
+
+class _Motion(NamedTuple):
+    """How drops slide."""
+
+    ratios: Float64
+    """(N,) radius over the median."""
+    slants: Float64
+    """(N,) pixels to the right per pixel down."""
+    slid_px: Float64
+    """(N,) since they landed, down if positive."""
+    places_px: Float64
+    """(N, 2) where they are."""
+
+
+def _motion_of(found: Float64, camera: Camera) -> _Motion:
+    draws = found[:, 3:]
+    ratio = np.interp(draws[:, 2], *_radius_quantiles())
+    # The rim of a small drop holds it: only large ones run.
+    loose = np.clip((ratio - 0.8) / 0.8, 0.0, 1.0)
+    slide_m_per_s = FASTEST_SLIDE_M_PER_S * draws[:, 3] ** 3 * loose
+    speed = float(np.linalg.norm(camera.velocity_m_per_s))
+    down = float(np.clip((UPHILL_M_PER_S - speed) / 2.0, -1.0, 1.0))
+    slid = slide_m_per_s * found[:, 1] * down * camera.focal_px[1] / GLASS_M
+    slant = 0.3 * (draws[:, 7] - 0.5)
+    place = _landing_px(found, camera)
+    start, span = _MARGIN[1] * camera.height, (1 + 2 * _MARGIN[1]) * camera.height
+    # What runs out of the glass comes in again at its other end: the mean number stays.
+    place[:, 1] = np.mod(place[:, 1] + 0.5 + slid + start, span) - start - 0.5
+    place[:, 0] += slant * slid
+    return _Motion(ratio, slant, slid, place)
 
 
 def _landing_px(found: Float64, camera: Camera) -> Float64:
@@ -98,43 +137,24 @@ def _landing_px(found: Float64, camera: Camera) -> Float64:
     return ((1 + 2 * margin) * found[:, 3:5] - margin) * size - 0.5
 
 
-def _placed(found: Float64, camera: Camera) -> Drops:
-    """Where enumerated drops are now, and what of them is drawn."""
-    slots, age_s, life_s = found[:, 0].astype(np.int64), found[:, 1], found[:, 2]
-    draws = found[:, 3:]
-    ratio = np.interp(draws[:, 2], *_radius_quantiles())
-    radius = 0.75 * MEDIAN_RADIUS * camera.width * ratio
-    # The rim of a small drop holds it: only large ones run.
-    loose = np.clip((ratio - 0.8) / 0.8, 0.0, 1.0)
-    slide_m_per_s = FASTEST_SLIDE_M_PER_S * draws[:, 3] ** 3 * loose
-    speed = float(np.linalg.norm(camera.velocity_m_per_s))
-    down = float(np.clip((UPHILL_M_PER_S - speed) / 2.0, -1.0, 1.0))
-    slid = slide_m_per_s * age_s * down * camera.focal_px[1] / GLASS_M
-    slant = 0.3 * (draws[:, 7] - 0.5)
-    place = _landing_px(found, camera)
-    start, span = _MARGIN[1] * camera.height, (1 + 2 * _MARGIN[1]) * camera.height
-    # What runs out of the glass comes in again at its other end: the mean number stays.
-    place[:, 1] = np.mod(place[:, 1] + 0.5 + slid + start, span) - start - 0.5
-    place[:, 0] += slant * slid
+def _bodies(found: Float64, motion: _Motion, camera: Camera) -> Float64:
+    """(N, COLUMNS) the drops themselves, but for what `_finished` fills in."""
+    age_s, life_s, draws = found[:, 1], found[:, 2], found[:, 3:]
     grown = _smooth((age_s + 0.05) / GROWN_S)
     presence = grown * _smooth((life_s - age_s) / FADED_S)
-    low, high = OPACITY_RANGE
-    opacity = (low + (high - low) * draws[:, 4]) * presence
-    radius = radius * (0.55 + 0.45 * grown)
+    radius = MAIN_DISC * MEDIAN_RADIUS * camera.width * motion.ratios * (0.55 + 0.45 * grown)
     bodies = np.zeros((len(found), COLUMNS))
-    bodies[:, columns.X], bodies[:, columns.Y] = place[:, 0], place[:, 1]
+    bodies[:, columns.X], bodies[:, columns.Y] = motion.places_px.T
     bodies[:, columns.RADIUS], bodies[:, columns.STRETCH] = radius, STRETCH
-    bodies[:, columns.SLANT], bodies[:, columns.OPACITY] = slant, opacity
+    bodies[:, columns.SLANT] = motion.slants
+    low, high = OPACITY_RANGE
+    bodies[:, columns.OPACITY] = (low + (high - low) * draws[:, 4]) * presence
     bodies[:, columns.GAIN] = 0.9 + 0.2 * draws[:, 6]
     low, high = CONTACT_RAD
-    bend_px = (WATER_INDEX - 1) * (low + (high - low) * draws[:, 5]) * camera.focal_px[0]
-    bodies[:, columns.REACH] = bend_px
+    bend_rad = (WATER_INDEX - 1) * (low + (high - low) * draws[:, 5])
+    bodies[:, columns.REACH] = bend_rad * camera.focal_px[0]
     _merge(bodies, radius, draws)
-    ran = np.abs(slid) > radius
-    left = _left_behind(bodies[ran], slid[ran], draws[ran])
-    # A runner's tail lies under it.
-    rows = _finished(np.concatenate([left, bodies]), camera)
-    return Drops(slots, age_s, place, radius, rows)
+    return bodies
 
 
 def _merge(bodies: Float64, radius: Float64, draws: Float64) -> None:
@@ -194,7 +214,8 @@ def _finished(rows: Float64, camera: Camera) -> Float32:
     discs = rows[:, columns.SIZE + 1 :].reshape(len(rows), DISCS, 3)
     outline = np.hypot(discs[..., 0], discs[..., 1]) + discs[..., 2]
     outline = np.maximum(outline.max(axis=1, initial=0.0), radius)
-    rows[:, columns.SIZE] = outline + 0.5 * soft + 0.13 * radius + 1.0
+    bulge = 0.25 * MERGE * radius * (discs[..., 2] > 0).sum(axis=1)
+    rows[:, columns.SIZE] = outline + 0.5 * soft + bulge + 1.0
     tall = rows[:, columns.SIZE] * rows[:, columns.STRETCH]
     wide = rows[:, columns.SIZE] + np.abs(rows[:, columns.SLANT]) * tall
     x, y = rows[:, columns.X], rows[:, columns.Y]

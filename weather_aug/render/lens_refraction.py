@@ -20,6 +20,8 @@ UInt8 = NDArray[np.uint8]
 
 DISCS = 3
 """Discs that may have merged with a drop's main one."""
+MERGE = 0.7
+"""Over what share of the main disc's radius discs flow together; each bulges by a quarter of it."""
 X, Y, RADIUS, STRETCH, SLANT, OPACITY, SOFT, REACH, BLUR, GAIN, SIZE = range(11)
 COLUMNS = SIZE + 1 + 3 * DISCS
 """Of a drop, float32: place of its centre, radius, length over width, shift to the right per pixel
@@ -154,7 +156,7 @@ def draw_drops(
             across, down, level = half * across, half * down, level + 1
         first, height, width = levels[level]
         per_soft, per_radius = one / drop[SOFT], one / radius
-        merge = half * radius
+        merge = np.float32(MERGE) * radius
         per_merge = one / merge
         tall = drop[SIZE] * stretch
         y0 = max(np.int64(np.floor(cy - tall)), window[0])

@@ -36,9 +36,11 @@ CROSSING = 0.025
 stroke."""
 BLADE_M_PER_S = 2.5
 """Of a real stroke; it sets how far the shutter smears the blade."""
+DULL_EXPOSURE_S = 0.015
+"""Under rain clouds no shutter is open for less; a recorded drive may have been sunny."""
 BLADE_M = 0.016
 """Width of blade and arm."""
-SMEARS = 9
+SMEARS = 6
 SMEAR_S = 0.9
 """A smear dries within this time."""
 _PLACES = 64
@@ -110,7 +112,7 @@ class Wiper:
         drawn = drawn.reshape(SMEARS, 1 + _PLACES)
         inner = self.pivot_px[1] - camera.height
         radius = inner + (self.outer_px - inner) * worn[0]
-        half_width = camera.width * (0.0015 + 0.006 * worn[1] ** 2)
+        half_width = camera.width * (0.0015 + 0.004 * worn[1] ** 2)
         opacity = 0.4 * drawn[:, 0] * max(1.0 - dry, 0.0) ** 2
         along = np.clip(1.6 * drawn[:, 1:] - 0.5, 0.0, 1.0)
         rows = np.stack([radius, half_width, opacity], axis=1)

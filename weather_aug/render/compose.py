@@ -20,9 +20,11 @@ from weather_aug.particles.shelter import Shelter
 from weather_aug.render.background import background_of, looked_at
 from weather_aug.render.fields import RigMotion, fields_of
 from weather_aug.render.label import NEIGHBOURHOOD_PX, readable_labels
+from weather_aug.render.lens import Glass
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.render.scattering import scattering_margin_px
 from weather_aug.render.stage import Planes, Stage
+from weather_aug.render.taken import camera_in, taken, window_taken
 from weather_aug.taxonomy import SKY
 from weather_aug.weather import Weather
 
@@ -113,15 +115,20 @@ def render(
     outer = _with_margin(window, _margin_px(frame, options), height, width)
     if layers is None:
         layers = looked_at(frame, ambience)
-    surface = background_of(frame, weather, ambience, outer, layers, options)
-    stage = Stage(surface, outer, frame.camera, weather, ambience, seed, air, options)
-    if options.preset == "physical":
-        fields = fields_of(weather, seed, air, ambience.axes_world, options, rig)
-        shot = stage.shaded(fields, shelter, frame.time_s)
-    else:
+    if options.preset != "physical":
+        surface = background_of(frame, weather, ambience, outer, layers, options)
         here = frame.camera.world_from_camera
+        stage = Stage(surface, outer, frame.camera, weather, ambience, seed, air, options)
         shot = stage.published(rig or RigMotion(here, here), frame.time_s)
-    return _trimmed(shot, frame, outer, window)
+        return _trimmed(shot, None, frame, outer, window)
+    outer = window_taken(outer, frame.camera, options)
+    surface = background_of(frame, weather, ambience, outer, layers, options)
+    camera = camera_in(frame.camera, weather, options)
+    stage = Stage(surface, outer, camera, weather, ambience, seed, air, options)
+    fields = fields_of(weather, seed, air, ambience.axes_world, options, rig)
+    shot = stage.shaded(fields, shelter, frame.time_s)
+    photo = taken(shot.image, frame, stage, fields, layers)
+    return _trimmed(shot._replace(image=photo.image), photo.glass, frame, outer, window)
 
 
 def warm_up() -> None:
@@ -191,8 +198,13 @@ def _seen(frame: Frame, window: Window) -> UInt8:
     return np.array(frame.label[_part(window)], order="C")
 
 
-def _trimmed(shot: Planes, frame: Frame, outer: Window, window: Window) -> RenderedFrame:
+def _trimmed(
+    shot: Planes, glass: Glass | None, frame: Frame, outer: Window, window: Window
+) -> RenderedFrame:
     """Labels from the outer window, then everything cut to the inner one."""
+    if glass is not None:
+        through = shot.transmittance * (np.float32(1.0) - glass.alpha)
+        shot = shot._replace(transmittance=through, covered=shot.covered | glass.hidden)
     part = _part((window[0] - outer[0], window[1] - outer[1], *window[2:]))
     cut = np.ascontiguousarray
     full = None if frame.label is None else np.array(frame.label[_part(window)], order="C")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from weather_aug._checks import finite, image_uint8
 from weather_aug._keys import check_seed
-from weather_aug.clip.types import Camera
+from weather_aug.clip.types import Camera, Window
 from weather_aug.colour import SRGB_LEVELS_LINEAR, srgb_from_linear
 from weather_aug.errors import ArgumentError
 from weather_aug.render.lens_drops import drops_on
@@ -36,7 +36,6 @@ from weather_aug.weather import Weather
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
-Window = tuple[int, int, int, int]
 
 HIDING_BLUR_PX = 4.0
 MOST_VEIL = 0.044

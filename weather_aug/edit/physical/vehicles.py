@@ -258,10 +258,10 @@ def _blobs_of(
         inside = (slice(top, top + height), slice(left, left + width))
         depths_m = depth[inside][names[inside] == name].astype(np.float64)
         first, start = top + corner[0], left + corner[1]
-        edges = (STEP_PX * float(edge) for edge in (start, start + width, first + height))
+        edges = (STEP_PX * start, STEP_PX * (start + width), STEP_PX * (first + height))
         # The nearest fifth: the face that looks at the camera, not the roof and the side behind.
         near_m = float(np.quantile(depths_m, 0.2))
-        blobs.append(_Blob(kind, *edges, depth_m=near_m))
+        blobs.append(_Blob(kind, *edges, near_m))
     return blobs
 
 

@@ -19,6 +19,8 @@ from weather_aug.render.medium import survival
 UInt8 = NDArray[np.uint8]
 
 HALO_EXPONENT = 0.8
+HALO_AREA = 2.0 * math.pi * math.gamma(2.0 / HALO_EXPONENT) / HALO_EXPONENT
+"""Integral of exp(-rho^0.8) over the plane."""
 LONGEST_STREAK = 3.0
 """A streak ends at so many standard deviations from its middle."""
 
@@ -69,7 +71,8 @@ def add_lamps(
             another shape.
     """
     image = image_uint8("image", image)
-    like_image("window", np.empty(window[2:], np.bool_), (image.shape[0], image.shape[1]))
+    if tuple(window[2:]) != image.shape[:2]:
+        raise ArgumentError(f"window {window} is not of the image's size {image.shape[:2]}")
     if ground is not None:
         like_image("ground", ground, (image.shape[0], image.shape[1]))
         if ground.dtype.itemsize != 1 or ground.dtype.kind not in "bu":
@@ -115,15 +118,13 @@ def _patch_of(lamps: Sequence[SeenLamp], window: Window) -> Window | None:
 
 
 _DECAY_STEPS = 2048
-_DECAY_FARTHEST = 3.0
+_DECAY_FARTHEST = 4.5
 """Square root of the distance in radii at which the table ends."""
 _DECAY = np.exp(
     -(np.linspace(0.0, _DECAY_FARTHEST, _DECAY_STEPS + 1) ** (2.0 * HALO_EXPONENT))
 ).astype(np.float32)
 """exp(-q^0.8) over the square root of q, where it is smooth."""
 _DECAY.flags.writeable = False
-_HALO_AREA = 2.0 * math.pi * math.gamma(2.0 / HALO_EXPONENT) / HALO_EXPONENT
-"""Integral of exp(-rho^0.8) over the plane."""
 _LINEAR = SRGB_LEVELS_LINEAR.astype(np.float32)
 _LINEAR.flags.writeable = False
 _BORDERS = (0.5 * (SRGB_LEVELS_LINEAR[1:] + SRGB_LEVELS_LINEAR[:-1])).astype(np.float32)
@@ -153,8 +154,8 @@ def _shine(lamp: Any, patch: Any, decay: Any, light: Any) -> None:
     reach2 = lamp.reach_px * lamp.reach_px
     core = lamp.core / (np.float32(2.0 * math.pi) * lamp.variance_px2)
     glow_r, halo_r = lamp.glow_radius_px, lamp.halo_radius_px
-    glow = lamp.glow / (np.float32(_HALO_AREA) * glow_r * glow_r)
-    halo = lamp.halo / (np.float32(_HALO_AREA) * halo_r * halo_r)
+    glow = lamp.glow / (np.float32(HALO_AREA) * glow_r * glow_r)
+    halo = lamp.halo / (np.float32(HALO_AREA) * halo_r * halo_r)
     glow_end, halo_end = _decayed(reach2, glow_r, decay), _decayed(reach2, halo_r, decay)
     first = max(np.int64(np.floor(lamp.v - lamp.reach_px)) - top, 0)
     last = min(np.int64(np.ceil(lamp.v + lamp.reach_px)) - top, height - 1)

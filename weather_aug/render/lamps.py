@@ -24,7 +24,7 @@ from weather_aug._keys import check_seed, key_of, uniforms
 from weather_aug.clip.types import Camera
 from weather_aug.colour import LUMINANCE
 from weather_aug.edit.physical.vehicles import Vehicle
-from weather_aug.render.lamp_light import SeenLamp
+from weather_aug.render.lamp_light import HALO_AREA, HALO_EXPONENT, SeenLamp
 
 Float64 = NDArray[np.float64]
 
@@ -38,6 +38,9 @@ HEAD_LAMP_COLOUR, TAIL_LAMP_COLOUR = (1.06, 1.0, 0.82), (1.0, 0.035, 0.02)
 """Linear RGB, scaled to a luminance of 1 where they are used."""
 LAMP_DIAMETER_M = 0.15
 HEAD_LAMP_HEIGHT_M, TAIL_LAMP_HEIGHT_M = 0.65, 0.85
+HEAD_LAMP_NEAR_M, TAIL_LAMP_NEAR_M = 6.0, 14.0
+"""Nearer than this a lamp fades, to nothing at half of it: the recorded vehicle's own lamps are
+then seen so well that a disc a hand's breadth beside them looks wrong."""
 INSET_M = 0.28
 """From the vehicle's side to the middle of the lamp."""
 LENS_SIGMA_PX = 0.7
@@ -46,8 +49,9 @@ GLOW_SHARE, GLOW_RAD = 0.04, 0.0035
 FORWARD_SHARE = 0.85
 """Of the light that fog scatters, what goes on almost as before."""
 HALO_RAD_PER_TAU, HALO_LEAST_RAD = 0.005, 0.002
-REACH_IN_RADII = 7.0
-LARGEST_REACH_PX = 400.0
+FAINTEST = 2e-4
+"""Linear light at which a profile is cut; the first level of a black pixel is 3e-4."""
+LARGEST_REACH_PX = 500.0
 OCCLUSION_M, OCCLUSION_RAMP_M = 0.7, 0.3
 """What is nearer than the lamp by more than the first hides it, by the second around that less and
 less: no lamp is switched on from one frame to the next."""
@@ -77,6 +81,8 @@ class Lamp:
     """Towards the camera, straight ahead."""
     road_intensity_cd: float
     """Towards the road before it."""
+    near_m: float
+    """Nearer than this it fades."""
 
 
 def lamps_of(
@@ -108,16 +114,16 @@ def _lamps_on(vehicle: Vehicle, up: Float64) -> list[Lamp]:
     ahead = vehicle.heading_world
     left = np.cross(up, ahead)
     ends = (
-        (1.0, HEAD_LAMP_HEIGHT_M, HEAD_LAMP_COLOUR, HEAD_LAMP_CD, ROAD_CD),
-        (-1.0, TAIL_LAMP_HEIGHT_M, TAIL_LAMP_COLOUR, TAIL_LAMP_CD, TAIL_LAMP_CD),
+        (1.0, HEAD_LAMP_HEIGHT_M, HEAD_LAMP_COLOUR, HEAD_LAMP_CD, ROAD_CD, HEAD_LAMP_NEAR_M),
+        (-1.0, TAIL_LAMP_HEIGHT_M, TAIL_LAMP_COLOUR, TAIL_LAMP_CD, TAIL_LAMP_CD, TAIL_LAMP_NEAR_M),
     )
     lamps = []
-    for end, height_m, tint, intensity_cd, road_cd in ends:
+    for end, height_m, tint, *powers in ends:
         colour = np.array(tint) / float(np.array(tint) @ LUMINANCE)
         for side in (1.0, -1.0):
             offset = 0.5 * end * length * ahead + side * (0.5 * width - INSET_M) * left
             place = vehicle.centre_world + offset + height_m * up
-            lamps.append(Lamp(place, end * ahead, up, height_m, colour, intensity_cd, road_cd))
+            lamps.append(Lamp(place, end * ahead, up, height_m, colour, *powers))
     return lamps
 
 
@@ -193,30 +199,39 @@ def _seen(
     (fx, fy), (cx, cy) = camera.focal_px, camera.principal_px
     u, v = cx + fx * x / z, cy + fy * y / z
     facing = float(away @ lamp.facing_world) / distance_m
-    aim = _ramp(facing, 0.05, 0.9)
+    aim = _ramp(facing, 0.05, 0.9) * _ramp(distance_m, 0.5 * lamp.near_m, lamp.near_m)
     tau = min(extinction_per_m * distance_m, MOST_DEPTH_TAU)
     radius_px = 0.5 * LAMP_DIAMETER_M * fx / z
     light = aim * white_per_cd * lamp.intensity_cd * fx * fy / distance_m**2
     halo_px = fx * (HALO_LEAST_RAD + HALO_RAD_PER_TAU * tau)
-    reach = min(REACH_IN_RADII * max(halo_px, GLOW_RAD * fx, radius_px), LARGEST_REACH_PX)
     outside = max(-u, -v, u - camera.width + 1, v - camera.height + 1)
-    if light <= 0.0 or outside > reach:
+    if light <= 0.0 or outside > LARGEST_REACH_PX:
         return None
     light *= _unhidden(depth_m, u, v, z, max(radius_px, 1.0))
     if light <= 0.0:
         return None
     direct, forward = math.exp(-tau), math.exp(-(1.0 - FORWARD_SHARE) * tau)
+    # A disc of radius r has the variance r^2 / 4 along each axis.
+    variance_px2 = 0.25 * radius_px**2 + LENS_SIGMA_PX**2
+    core, glow = light * direct * (1.0 - GLOW_SHARE), light * direct * GLOW_SHARE
+    halo = light * (forward - direct)
+    reach = max(
+        _core_reach_px(core, variance_px2),
+        _halo_reach_px(glow, GLOW_RAD * fx),
+        _halo_reach_px(halo, halo_px),
+    )
+    if reach <= 0.0 or outside > reach:
+        return None
     streak = _streak(lamp, camera, distance_m, camera_height_m)
     mirrored = lamp.road_intensity_cd / lamp.intensity_cd * wetness * streak.reflectance
     values = (
         u,
         v,
-        # A disc of radius r has the variance r^2 / 4 along each axis.
-        0.25 * radius_px**2 + LENS_SIGMA_PX**2,
-        light * direct * (1.0 - GLOW_SHARE),
-        light * direct * GLOW_SHARE,
+        variance_px2,
+        core,
+        glow,
         GLOW_RAD * fx,
-        light * (forward - direct),
+        halo,
         halo_px,
         reach,
         streak.u,
@@ -228,6 +243,19 @@ def _seen(
         *lamp.colour,
     )
     return SeenLamp(*(np.float32(value) for value in values))
+
+
+def _core_reach_px(light: float, variance_px2: float) -> float:
+    """Where a Gaussian of this light falls to the faintest that counts, pixels."""
+    peak = light / (2.0 * math.pi * variance_px2 * FAINTEST)
+    return math.sqrt(2.0 * variance_px2 * math.log(peak)) if peak > 1.0 else 0.0
+
+
+def _halo_reach_px(light: float, radius_px: float) -> float:
+    """Where a halo of this light falls to the faintest that counts, pixels."""
+    peak = light / (HALO_AREA * radius_px**2 * FAINTEST)
+    reach = radius_px * math.log(peak) ** (1.0 / HALO_EXPONENT) if peak > 1.0 else 0.0
+    return min(reach, LARGEST_REACH_PX)
 
 
 def _ramp(value: float, low: float, high: float) -> float:

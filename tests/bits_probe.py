@@ -21,12 +21,12 @@ import numpy as np
 
 from weather_aug.clip.types import Camera, Frame, FrameKey
 from weather_aug.edit.ambience import ambience_of
+from weather_aug.edit.surface import Surface, depth_of
 from weather_aug.particles.shelter import Shelter
 from weather_aug.render import stage
 from weather_aug.render.compose import RenderedFrame, render
 from weather_aug.render.fields import RigMotion
 from weather_aug.render.options import RenderOptions
-from weather_aug.render.surface import Surface, depth_of
 from weather_aug.taxonomy import BUILDING, ROAD, SKY
 from weather_aug.weather import Weather
 

@@ -29,7 +29,7 @@ def doubled(x):
 """
 PROBE = """
 import numpy as np
-from weather_aug.render.surface import Surface, depth_row
+from weather_aug.edit.surface import Surface, depth_row
 bytes_, halves = np.empty(0, np.uint8), np.empty(0, np.uint16)
 depth = np.array([50000.0], np.float32)
 surface = Surface(bytes_.reshape(0, 3), (0, 0, 1, 1), halves, depth, bytes_, 1)

@@ -23,7 +23,7 @@ STAGES = (
     "view",
     "writers",
 )
-LEAVES = ("weather", "air", "timeline", "taxonomy", "colour", "errors")
+LEAVES = ("weather", "severity", "air", "timeline", "taxonomy", "colour", "errors")
 FREE = ("cli", "doctor")
 """They stand outside the flow and may know everybody."""
 

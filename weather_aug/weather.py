@@ -28,7 +28,7 @@ class Weather:
         the clip's first heading, to its left, up). Severity s in [0, 1] names a physical state, it
         is not part of it; see `weather_aug.severity`. A Weather is a state at one moment and knows
         no time: how its gusts blow and how far they carry the air is `weather_aug.air`, how weather
-        changes is `WeatherTimeline`. Gustiness, snow wetness, fog patchiness and puffs only shape the
+        changes is `WeatherTimeline`. Gustiness, snow wetness, patchiness and puffs only shape the
         wind, snow and fog that are there; without those they mean nothing.
 
     Raises:

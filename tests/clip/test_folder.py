@@ -117,8 +117,8 @@ def test_label_files_that_do_not_tell_need_a_taxonomy(tmp_path: Path) -> None:
     _labels(tmp_path / "labels" / "a.png")
     with pytest.raises(ArgumentError, match=r"labels do not say.*taxonomy=") as caught:
         FolderClip(tmp_path, images="images", labels="labels")
-    assert all(name in str(caught.value) for name in taxonomy._TAXONOMIES)
-    for name in taxonomy._TAXONOMIES:
+    assert all(name in str(caught.value) for name in taxonomy.TAXONOMIES)
+    for name in taxonomy.TAXONOMIES:
         assert FolderClip(tmp_path, images="images", labels="labels", taxonomy=name).keys
     with pytest.raises(ClipError, match="nowhere does not exist"):
         FolderClip(tmp_path, images="images", labels="nowhere")

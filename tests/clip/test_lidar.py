@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from weather_aug.clip import lidar
 from weather_aug.clip.completion import completed, sharpened
 from weather_aug.clip.lidar import lidar_depth, projected_depth, without_see_through
 from weather_aug.errors import ArgumentError
@@ -122,3 +123,20 @@ def test_ramps_become_steps_and_planes_stay() -> None:
     assert set(np.unique(step)) == {np.float32(0.02), np.float32(0.2)}
     plane = np.tile(np.linspace(0.1, 0.2, 60, dtype=np.float32), (20, 1))
     np.testing.assert_array_equal(plane, sharpened(plane, min_jump=4e-3))
+
+
+def test_a_halo_around_a_sign_goes() -> None:
+    truth = np.full((HEIGHT, WIDTH), 30.0)
+    truth[40:70, 90:110] = 8.0
+    image = np.full((HEIGHT, WIDTH, 3), (40, 60, 40), np.int64)
+    image[40:70, 90:110] = (200, 150, 30)
+    # Texture, so that the completion alone has edges everywhere.
+    image += np.random.default_rng(0).integers(-14, 15, (HEIGHT, WIDTH, 1))
+    label = np.full((HEIGHT, WIDTH), BUILDING, np.uint8)
+    points = _scan(truth, 8, 5)
+    shown = image.clip(0, 255).astype(np.uint8)
+    wrong = (np.abs(lidar_depth(points, INTRINSICS, shown, label) - truth) > 1).mean()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lidar, "refined", lambda depth, image, **options: depth)
+        haloed = (np.abs(lidar_depth(points, INTRINSICS, shown, label) - truth) > 1).mean()
+    assert wrong < 0.5 * haloed

@@ -6,10 +6,9 @@ from oracles.reference_render import linear, optical_depth, rays, srgb
 from render_scene import make_camera, make_frame
 from scipy.integrate import quad
 
+from weather_aug._rows import encode_row, survival
 from weather_aug.colour import SRGB_LEVELS_LINEAR
 from weather_aug.render.compose import render
-from weather_aug.render.medium import survival
-from weather_aug.render.shade import encode_row
 from weather_aug.weather import Weather
 
 

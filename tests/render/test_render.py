@@ -11,6 +11,7 @@ from render_scene import make_camera, make_frame
 from weather_aug.air import Air
 from weather_aug.clip.types import Frame
 from weather_aug.edit.ambience import Ambience, airlight_from_sky, ambience_of
+from weather_aug.edit.surface import depth_of, surface_of
 from weather_aug.errors import ArgumentError
 from weather_aug.particles.kernels import scatter, solve_reach
 from weather_aug.render.compose import checked_window, render, warm_up
@@ -18,7 +19,6 @@ from weather_aug.render.label import read_labels
 from weather_aug.render.options import RenderOptions
 from weather_aug.render.project import project, sorted_in_blocks, split_by_band
 from weather_aug.render.shade import shade
-from weather_aug.render.surface import depth_of, surface_of
 from weather_aug.scene.policy import weather_of
 from weather_aug.taxonomy import SKY
 from weather_aug.weather import Weather

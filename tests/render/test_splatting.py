@@ -8,6 +8,7 @@ from oracles import reference_render as reference
 from render_scene import make_camera, make_frame
 
 from weather_aug.air import air_of
+from weather_aug.edit.surface import surface_of
 from weather_aug.render.compose import render
 from weather_aug.render.fields import fields_of
 from weather_aug.render.froxels import even_fog
@@ -18,7 +19,6 @@ from weather_aug.render.project import BAND_ROWS, FAINTEST, log, sorted_in_block
 from weather_aug.render.project import project as project_kernel
 from weather_aug.render.shade import Tone, shade
 from weather_aug.render.stage import optics_of
-from weather_aug.render.surface import surface_of
 from weather_aug.weather import Weather
 
 UP = np.array([0.0, 0, 1])

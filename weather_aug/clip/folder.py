@@ -35,7 +35,7 @@ from weather_aug.clip.records import (
 from weather_aug.clip.sky import sky_mask
 from weather_aug.clip.types import Camera, Frame, FrameKey, check_key
 from weather_aug.errors import ArgumentError, ClipError, printable
-from weather_aug.taxonomy import SKY
+from weather_aug.taxonomy import SKY, TAXONOMIES
 from weather_aug.taxonomy import taxonomy as taxonomy_called
 
 Float32 = NDArray[np.float32]
@@ -47,8 +47,6 @@ MIN_DEPTH_M, MAX_DEPTH_M = 0.1, 1000.0
 
 _PICTURES = (".png", ".jpg", ".jpeg")
 _IMAGE_ENDINGS = ("_leftImg8bit", "_rgb_anon", "_rgb_ref_anon")
-TAXONOMIES = ("train_ids", "cityscapes", "camvid11")
-"""What `taxonomy=` accepts."""
 _LABEL_ENDINGS_BY_TAXONOMY = {
     "cityscapes": ("_gtFine_labelIds", "_gtCoarse_labelIds", "_gt_labelIds"),
     "train_ids": ("_gtFine_labelTrainIds", "_gtCoarse_labelTrainIds", "_gt_labelTrainIds"),

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from weather_aug._checks import image_uint8, like_image
 from weather_aug.clip.completion import completed, depth_jump, sharpened
+from weather_aug.clip.edges import refined
 from weather_aug.clip.sky import sky_mask
 from weather_aug.errors import ArgumentError
 from weather_aug.taxonomy import SKY
@@ -24,6 +25,8 @@ HOLD = 20.0
 HOLD_AT_JUMP = 0.2
 JUMP_RATIO = 1.3
 MIN_RETURNS = 6
+MAX_REACH_PX = 16
+MIN_BELIEF = 0.5
 
 
 def lidar_depth(
@@ -70,7 +73,14 @@ def lidar_depth(
     smooth = completed(inverse, confidence, image, barrier=sky)
     sharp = sharpened(smooth, min_jump=depth_jump(float(intrinsics[1, 1])))
     depth = 1 / np.clip(sharp, 1 / MAX_DEPTH_M, 1 / MIN_DEPTH_M)
-    return np.where(sky, np.inf, depth).astype(np.float32)
+    return refined(
+        np.where(sky, np.inf, depth).astype(np.float32),
+        image,
+        label=label,
+        confidence=_belief(measured, _line_px(intrinsics)),
+        min_jump_per_m=depth_jump(float(intrinsics[1, 1])),
+        reach_px=min(MAX_REACH_PX, max(6, _line_px(intrinsics))),
+    )
 
 
 def projected_depth(
@@ -109,6 +119,12 @@ def without_see_through(sparse: Float32, focal_px: float) -> Float32:
     below = cv2.erode(depth, wide, anchor=(side, 0))
     hidden = (np.maximum(left, right) < limit) | (np.maximum(above, below) < limit)
     return np.where(hidden, 0, sparse).astype(np.float32)
+
+
+def _belief(measured: NDArray[np.bool_], side: int) -> Float32:
+    """How far each depth is believed: by how far away the next return is."""
+    away = cv2.distanceTransform((~measured).astype(np.uint8), cv2.DIST_L2, 3)
+    return np.maximum(MIN_BELIEF, 1 / (1 + (2 * away / side) ** 2)).astype(np.float32)
 
 
 def _returning(measured: NDArray[np.bool_], side: int) -> NDArray[np.bool_]:

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from weather_aug._checks import finite, image_uint8, like_image
 from weather_aug._compiled import compiled
 from weather_aug.clip.completion import completed, sharpened
+from weather_aug.clip.edges import OtherView, refined
+from weather_aug.clip.posts import post_disparity
 from weather_aug.clip.sky import sky_mask, texture
 from weather_aug.errors import ArgumentError
 from weather_aug.taxonomy import SKY
@@ -25,6 +27,13 @@ GUESS_CONFIDENCE = 0.02
 MIN_DISPARITY_PX = 0.4
 MIN_DEPTH_M = 2.5
 MIN_TEXTURE = 6.0
+MIN_JUMP_PX = 1.5
+EDGE_REACH_PX = 10
+MATCH_BELIEF = 0.33
+BLUE_GREY_LEVELS = 35
+HIGH_SHARE = 0.9
+ISLAND_SHARE = 2e-3
+ISLAND_GREY_LEVELS = 20.0
 
 
 class Disparity(NamedTuple):
@@ -74,20 +83,40 @@ def stereo_depth(
         # White walls look like sky; matches nearer than 100 m say otherwise, but only where there
         # is something to match: empty sky gives consistent nonsense.
         near = match.trusted & (match.disparity_px > focal_px * baseline_m / 100.0)
-        sky = sky_mask(left) & ~_dense(near & (texture(left) > MIN_TEXTURE))
+        looks = sky_mask(left)
+        gaps = _blue_gaps(looks, left)
+        sky = looks & (gaps | ~_dense(near & (texture(left) > MIN_TEXTURE)))
     else:
         like_image("label", label, left.shape[:2])
         sky = label == SKY
-    trusted = match.trusted & ~sky
-    filled, hidden = _from_background(match.disparity_px, trusted)
-    values = np.where(trusted, match.disparity_px, filled)
+    posts = post_disparity(left, right, max_disparity_px=reach_px)
+    # A post that is no nearer than what was matched there is drawn on it.
+    posts[posts < np.where(match.trusted & ~sky, match.disparity_px + MIN_JUMP_PX, 0)] = 0
+    posts[posts > _nearest_below(match) + MIN_JUMP_PX] = 0
+    if label is None:
+        sky &= posts < MIN_JUMP_PX
+        sky &= gaps | ~_nearer_islands(sky, match, left, right)
+    matched_px = np.where(posts > 0, posts, match.disparity_px)
+    trusted = (match.trusted | (posts > 0)) & ~sky
+    filled, hidden = _from_background(matched_px, trusted)
+    values = np.where(trusted, matched_px, filled)
     guessed = np.where(hidden, HIDDEN_CONFIDENCE, GUESS_CONFIDENCE)
     confidence = np.where(trusted, 1.0, guessed).astype(np.float32)
     confidence[sky | (values <= 0)] = 0
     smooth = completed(values, confidence, left, barrier=sky, stiffness=4.0)
-    sharp = sharpened(smooth, min_jump=1.5)
+    sharp = sharpened(smooth, min_jump=MIN_JUMP_PX)
     depth = focal_px * baseline_m / np.maximum(sharp, MIN_DISPARITY_PX)
-    return np.where(sky, np.inf, depth).astype(np.float32)
+    dense = np.where(sky, np.inf, depth).astype(np.float32)
+    belief = np.where(posts > 0, 1, np.where(sky | trusted | hidden, MATCH_BELIEF, 0))
+    return refined(
+        dense,
+        left,
+        label=label,
+        confidence=np.asarray(belief, np.float32),
+        other_view=OtherView(right, focal_px * baseline_m),
+        min_jump_per_m=MIN_JUMP_PX / (focal_px * baseline_m),
+        reach_px=EDGE_REACH_PX,
+    )
 
 
 def right_depth(
@@ -151,6 +180,53 @@ def _matched(left: NDArray[np.uint8], right: NDArray[np.uint8], count: int) -> F
     ]
     sixteenths = matcher.compute(*wide)[:, count:]
     return sixteenths.astype(np.float32) / 16
+
+
+def _nearest_below(match: Disparity) -> Float32:
+    """Greatest disparity in a column at or below each row: what stands there is no nearer."""
+    known = np.where(match.trusted, match.disparity_px, 0).astype(np.float32)
+    steady = cv2.dilate(cv2.medianBlur(known, 5), np.ones((1, 9), np.uint8))
+    return np.asarray(np.maximum.accumulate(steady[::-1], axis=0)[::-1], np.float32)
+
+
+def _blue_gaps(sky: NDArray[np.bool_], image: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Sky of a colour that is nothing but sky: blue, and as high as most of the sky.
+
+    Matching cannot contradict it: a gap between leaves moves with the leaves.
+    """
+    blue = image[..., 2].astype(np.int16) - image[..., 0] > BLUE_GREY_LEVELS
+    lowest = np.searchsorted(np.cumsum(sky.sum(axis=1)), HIGH_SHARE * sky.sum())
+    high = np.arange(len(sky))[:, None] < lowest
+    return np.asarray(sky & blue & high)
+
+
+def _nearer_islands(
+    sky: NDArray[np.bool_],
+    match: Disparity,
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+) -> NDArray[np.bool_]:
+    """Small pieces of sky that the right picture shows where a near thing would be: white signs."""
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(sky.astype(np.uint8))
+    small = stats[:, cv2.CC_STAT_AREA] < ISLAND_SHARE * sky.size
+    small[0] = False
+    numbered = cv2.dilate(np.where(small[parts], parts, 0).astype(np.float32), np.ones((7, 7)))
+    part = numbered.astype(np.int32)
+    rim = (part > 0) & match.trusted & ~sky
+    matched = np.bincount(part[rim], minlength=count)
+    around = np.bincount(part[rim], match.disparity_px[rim], count) / np.maximum(matched, 1)
+    # With its rim, for a piece of one colour matches anywhere within itself.
+    rows, columns = np.nonzero(part > 0)
+    piece = part[rows, columns]
+    off_px = np.rint(around[piece]).astype(np.int64)
+    here = left[rows, columns].astype(np.int32)
+    as_far = np.abs(here - right[rows, columns]).sum(axis=1)
+    as_near = np.abs(here - right[rows, np.maximum(columns - off_px, 0)]).sum(axis=1)
+    better = np.bincount(piece, as_far - as_near, count) / np.maximum(
+        np.bincount(piece, minlength=count), 1
+    )
+    nearer = small & (better > ISLAND_GREY_LEVELS) & (matched > 0)
+    return np.asarray(nearer[parts] & sky)
 
 
 def _dense(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -21,6 +21,8 @@ from weather_aug._checks import MAX_PIXELS
 from weather_aug.errors import CalibrationError, ClipError, DataError, printable
 
 Float64 = NDArray[np.float64]
+Window = tuple[int, int, int, int]
+"""(top, left, height, width) of a part of a picture, pixels."""
 
 RIGID_TOLERANCE = 1e-4
 MAX_SPEED_M_PER_S = 150.0

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from weather_aug._keys import key_of
 from weather_aug.air import Air
-from weather_aug.clip.types import Camera
+from weather_aug.clip.types import Camera, Window
 from weather_aug.errors import ArgumentError
 from weather_aug.particles import kernels
 from weather_aug.particles.resolve import (
@@ -47,8 +47,6 @@ BEYOND_PICTURE = 1.0
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
-Window = tuple[int, int, int, int]
-"""(top, left, height, width) of a part of a picture, pixels."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,10 +33,10 @@ from numpy.typing import NDArray
 
 from weather_aug._checks import finite
 from weather_aug._keys import check_seed, key_of
-from weather_aug.clip.types import Camera
+from weather_aug.clip.types import Camera, Window
 from weather_aug.errors import ArgumentError
 from weather_aug.particles import published_kernels as kernels
-from weather_aug.particles.field import Window, padded_tangents
+from weather_aug.particles.field import padded_tangents
 from weather_aug.particles.published_presets import BOX_AXES, PublishedPreset
 from weather_aug.particles.resolve import NEAR_M
 

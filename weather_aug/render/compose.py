@@ -11,17 +11,18 @@ from numpy.typing import NDArray
 
 from weather_aug._keys import check_seed
 from weather_aug.air import Air, air_of
-from weather_aug.clip.types import Camera, Frame, FrameKey
+from weather_aug.clip.types import Camera, Frame, FrameKey, Window
 from weather_aug.edit.ambience import Ambience
+from weather_aug.edit.physical.layers import Layers
+from weather_aug.edit.surface import checked_window, depth_of, surface_of
 from weather_aug.errors import ArgumentError
-from weather_aug.particles.field import Window
 from weather_aug.particles.shelter import Shelter
+from weather_aug.render.background import background_of, looked_at
 from weather_aug.render.fields import RigMotion, fields_of
 from weather_aug.render.label import NEIGHBOURHOOD_PX, readable_labels
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.render.scattering import scattering_margin_px
 from weather_aug.render.stage import Planes, Stage
-from weather_aug.render.surface import depth_of, surface_of
 from weather_aug.taxonomy import SKY
 from weather_aug.weather import Weather
 
@@ -64,6 +65,7 @@ def render(
     air: Air | None = None,
     shelter: Shelter | None = None,
     rig: RigMotion | None = None,
+    layers: Layers | None = None,
     options: RenderOptions = DEFAULT_OPTIONS,
 ) -> RenderedFrame:
     """Render `frame` in `weather`: a pure function of its arguments.
@@ -82,6 +84,8 @@ def render(
         shelter: Bridges and roofs of the street, None for an open sky.
         rig: Motion of the reference camera, for options that carry the particles along with it; if
             None, this camera stood at time 0 where it stands.
+        layers: What the editor knows of the frame; if None, it looks at the frame now, and the way
+            driven is taken to go straight ahead.
         options: Choices besides the weather.
 
     Raises:
@@ -107,7 +111,9 @@ def render(
     if air is None:
         air = air_of(weather, frame.time_s, seed)
     outer = _with_margin(window, _margin_px(frame, options), height, width)
-    surface = surface_of(frame)
+    if layers is None:
+        layers = looked_at(frame, ambience)
+    surface = background_of(frame, weather, ambience, outer, layers, options)
     stage = Stage(surface, outer, frame.camera, weather, ambience, seed, air, options)
     if options.preset == "physical":
         fields = fields_of(weather, seed, air, ambience.axes_world, options, rig)
@@ -116,23 +122,6 @@ def render(
         here = frame.camera.world_from_camera
         shot = stage.published(rig or RigMotion(here, here), frame.time_s)
     return _trimmed(shot, frame, outer, window)
-
-
-def checked_window(window: Window | None, height: int, width: int) -> Window:
-    """`window` as integers, or the whole picture; refuse one that leaves the picture."""
-    if window is None:
-        return (0, 0, height, width)
-    try:
-        top, left, rows, columns = (v.__index__() for v in window)
-    except (AttributeError, TypeError, ValueError):
-        raise ArgumentError(
-            f"window must be four integers (top, left, height, width), got {window!r}"
-        ) from None
-    if not (0 <= top and 0 <= left and rows > 0 and columns > 0):
-        raise ArgumentError(f"window {window} must be (top >= 0, left >= 0, height > 0, width > 0)")
-    if top + rows > height or left + columns > width:
-        raise ArgumentError(f"window {window} leaves the picture of {height}x{width} pixels")
-    return (top, left, rows, columns)
 
 
 def warm_up() -> None:
@@ -186,12 +175,8 @@ def _with_margin(window: Window, margin: int, height: int, width: int) -> Window
 
 
 def _margin_px(frame: Frame, options: RenderOptions) -> int:
-    """How far around a pixel its label and colour depend on the picture.
-
-    Labels look around themselves, and so does the sky where only depth tells of it.
-    """
-    looks = 1 if frame.label is not None else 2
-    margin = looks * (NEIGHBOURHOOD_PX // 2)
+    """How far around a pixel its label and colour depend on the picture."""
+    margin = NEIGHBOURHOOD_PX // 2
     if options.multiple_scattering:
         margin += scattering_margin_px(max(frame.camera.focal_px), math.inf)
     return margin

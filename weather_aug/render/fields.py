@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug.air import Air
-from weather_aug.clip.types import Camera
+from weather_aug.clip.types import Camera, Window
 from weather_aug.edit.ambience import Ambience
 from weather_aug.particles import statistics
-from weather_aug.particles.field import ParticleField, Window
+from weather_aug.particles.field import ParticleField
 from weather_aug.particles.published import PublishedField, field_from_world
 from weather_aug.particles.published_presets import published_preset
 from weather_aug.particles.resolve import DEPTH_BINS, Resolved

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from weather_aug._checks import finite
 from weather_aug._keys import check_seed, key_of
 from weather_aug.air import Air
-from weather_aug.clip.types import Camera
-from weather_aug.particles.field import Window
+from weather_aug.clip.types import Camera, Window
 from weather_aug.render import patches, puffs
 from weather_aug.render.froxels import (
     NEAR_SLICES,

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from weather_aug._compiled import compiled, inlined
+from weather_aug._rows import survival
 from weather_aug.clip.types import FAR_DEPTH_M
 from weather_aug.render.froxels import share_row
 
@@ -59,25 +60,6 @@ class Medium(NamedTuple):
     """At the road's surface."""
     camera_heights: np.float32
     """Height of the camera over the road, in scale heights of the spray."""
-
-
-@compiled
-def survival(optical_depth):
-    """exp(-x) for x in [-16, 80] to 2e-5, in operations that give equal bits on every machine."""
-    x = optical_depth * np.float32(-0.015625)
-    one = np.float32(1.0)
-    p = one + x * np.float32(1.0 / 6.0)
-    p = one + x * np.float32(0.2) * p
-    p = one + x * np.float32(0.25) * p
-    p = one + x * np.float32(1.0 / 3.0) * p
-    p = one + x * np.float32(0.5) * p
-    p = one + x * p
-    p = p * p
-    p = p * p
-    p = p * p
-    p = p * p
-    p = p * p
-    return p * p
 
 
 @compiled

@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from weather_aug._compiled import compiled, inlined
+from weather_aug._rows import survival
 from weather_aug.particles.kernels import cell_key
 from weather_aug.render.froxels import even_layer
-from weather_aug.render.medium import survival
 
 
 @compiled

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from weather_aug._compiled import compiled, inlined
+from weather_aug._rows import survival
 from weather_aug.particles.field import COVARIANCE, OPACITY, VELOCITY
-from weather_aug.render.medium import carried_at, near_optical_depth, survival
+from weather_aug.render.medium import carried_at, near_optical_depth
 
 BAND_ROWS = 8
 """Rows that are shaded, splatted and encoded together, while they are in the cache."""

@@ -12,8 +12,8 @@ import math
 import numpy as np
 
 from weather_aug._compiled import compiled, inlined
+from weather_aug._rows import survival
 from weather_aug.particles.kernels import GOLDEN, cell_key, mix64
-from weather_aug.render.medium import survival
 
 CUT = 3.0
 """Reach of a puff in standard deviations; what is cut off is made good inside."""

@@ -1,43 +1,30 @@
-"""Tone, fog and particles over a picture, band by band, in linear light. Compiled.
+"""Fog and particles over a picture, band by band, in linear light. Compiled.
 
 Serial and without fast-math, so that the same arguments give the same bits in every process.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from weather_aug._compiled import compiled
+from weather_aug._rows import encode_row
+from weather_aug.edit.surface import depth_row, light_row, sky_row
 from weather_aug.render.medium import air_row, rays_across, row_space
 from weather_aug.render.project import BAND_ROWS, LARGE
-from weather_aug.render.surface import depth_row, light_row, sky_row
 from weather_aug.render.tile import TILE_FLOATS, blend_band, cover_splat
-
-
-class Tone(NamedTuple):
-    """How the weather's light changes the recorded colours, float32."""
-
-    overcast: np.float32
-    sky_luminance: np.float32
-    zenith_gain: np.float32
-    encoded: np.float32
-    """1 where colours are blended as they are stored, in sRGB; 0 in linear light."""
 
 
 @compiled
 def shade(
     surface,
-    ring,
     patches,
     window,
     optics,
     medium,
     resolved_depth,
     linear,
-    matrix,
-    tone,
+    encoded,
     airlight,
     splats,
     band_starts,
@@ -47,19 +34,17 @@ def shade(
     distinct,
     covered,
 ):
-    """Render the window: tone, fog and particles in linear light, band by band.
+    """Render the window: fog and particles in linear light, band by band.
 
     Args:
-        surface: The recorded picture.
-        ring: (H, W) bool of the window, where the sky may show; (0, 0) where there are labels.
+        surface: The background.
         patches: FogVolume, of no slices where the fog is even.
         window: (top, left, height, width) in the whole picture.
         optics: Camera of the whole picture.
         medium: Air.
         resolved_depth: Optical depth of resolved particles by depth.
-        linear: (256,) float32 toned light by sRGB level.
-        matrix: (3, 3) float32 colour matrix after it.
-        tone: Sky.
+        linear: (256,) float32 light by sRGB level.
+        encoded: Whether colours are blended as they are stored, in sRGB; `linear` is then so, too.
         airlight: (3,) float32.
         splats: (M, 16) float32, band by band.
         band_starts: (bands + 1,) where each band's splats start.
@@ -88,8 +73,6 @@ def shade(
     tiles = np.empty((BAND_ROWS // 4, stride // 4, TILE_FLOATS), np.float32)
     gap = np.empty((BAND_ROWS, wide), np.float32)
     sky = np.zeros((BAND_ROWS, wide), np.uint8)
-    shown = np.zeros(wide, np.uint8)
-    overcast = tone.overcast > np.float32(0.0)
     hidden = 0
     for band in range(band_starts.shape[0] - 1):
         y0 = band * BAND_ROWS
@@ -116,13 +99,6 @@ def shade(
                 clear,
             )
             light_row(surface, y + top, left, linear, red[:width], green[:width], blue[:width])
-            if overcast:
-                if ring.shape[0] > 0:
-                    for x in range(width):
-                        shown[x] = np.uint8(ring[y, x])
-                else:
-                    shown = sky[k]
-                _overcast_row(shown, ray_x, ray_y, optics, matrix, tone, airlight, red, green, blue)
             _fog_row(clear, airlight, red, green, blue, gap[k])
         mine = splats[band_starts[band] : band_starts[band + 1]]
         blend_band(mine, window, y0, planes, tiles)
@@ -132,7 +108,7 @@ def shade(
         for y in range(y0, y1):
             k = y - y0
             for channel in range(3):
-                if tone.encoded > np.float32(0.0):
+                if encoded:
                     _level_row(planes[k, channel, :wide], out[channel, y])
                 else:
                     encode_row(planes[k, channel, :wide], out[channel, y])
@@ -140,32 +116,6 @@ def shade(
             _distinct_row(gap[k], through[y], sky[k], least_contrast, distinct[y])
             hidden += _count_below(through[y], sky[k], hazy)
     return hidden
-
-
-@compiled
-def _overcast_row(sky, ray_x, ray_y, optics, matrix, tone, airlight, red, green, blue):
-    """Change the colours of one row, and its sky towards an overcast one."""
-    zero, one = np.float32(0.0), np.float32(1.0)
-    a0, a1, a2 = airlight[0], airlight[1], airlight[2]
-    across = one + ray_y * ray_y
-    rise_y = optics.up_y * ray_y + optics.up_z
-    brightest = np.float32(3.0) / tone.sky_luminance
-    for x in range(sky.shape[0]):
-        r, g, b = red[x], green[x], blue[x]
-        y = np.float32(0.2126) * r + np.float32(0.7152) * g + np.float32(0.0722) * b
-        # Leaves and wires inside the sky's label are dark: they stay what they are.
-        matte = y * brightest - np.float32(0.9)
-        matte = matte if matte > zero else zero
-        matte = matte if matte < one else one
-        weight = tone.overcast * matte if sky[x] != 0 else zero
-        sine = (optics.up_x * ray_x[x] + rise_y) / np.sqrt(across + ray_x[x] * ray_x[x])
-        brighter = one + tone.zenith_gain * (sine if sine > zero else zero)
-        r_new = matrix[0, 0] * r + matrix[0, 1] * g + matrix[0, 2] * b
-        g_new = matrix[1, 0] * r + matrix[1, 1] * g + matrix[1, 2] * b
-        b_new = matrix[2, 0] * r + matrix[2, 1] * g + matrix[2, 2] * b
-        red[x] = r_new + weight * (a0 * brighter - r_new)
-        green[x] = g_new + weight * (a1 * brighter - g_new)
-        blue[x] = b_new + weight * (a2 * brighter - b_new)
 
 
 @compiled
@@ -179,28 +129,6 @@ def _fog_row(through, airlight, red, green, blue, gap):
         dr, dg, db = abs(dr), abs(dg), abs(db)
         most = dr if dr > dg else dg
         gap[x] = most if most > db else db
-
-
-@compiled
-def encode_row(light, out):
-    """Turn linear light into sRGB levels, rounded, with an error of 0.1 of a level before that.
-
-    A polynomial in the square root on the power branch (largest error 0.083 levels), the exact
-    line below it; every 8-bit level survives decoding and encoding.
-    """
-    zero, one = np.float32(0.0), np.float32(1.0)
-    for x in range(light.shape[0]):
-        v = light[x]
-        v = v if v > zero else zero
-        v = v if v < one else one
-        s = np.sqrt(v)
-        p = np.float32(-1.6236571) + s * np.float32(0.5173023)
-        p = np.float32(2.0315735) + s * p
-        p = np.float32(-1.4027363) + s * p
-        p = np.float32(1.5179509) + s * p
-        p = np.float32(-0.0401096) + s * p
-        p = p if v > np.float32(0.0031308) else np.float32(12.92) * v
-        out[x] = np.uint8(np.int32(p * np.float32(255.0) + np.float32(0.5)))
 
 
 @compiled

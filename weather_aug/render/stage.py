@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug.air import Air
-from weather_aug.clip.types import Camera
-from weather_aug.colour import LUMINANCE, SRGB_LEVELS_LINEAR
+from weather_aug.clip.types import Camera, Window
+from weather_aug.colour import SRGB_LEVELS_LINEAR
 from weather_aug.edit.ambience import Ambience
-from weather_aug.edit.physical.overcast import ZENITH_GAIN, tone
-from weather_aug.particles.field import ParticleField, Window
+from weather_aug.edit.surface import Surface, depth_of, repainted
+from weather_aug.particles.field import ParticleField
 from weather_aug.particles.resolve import DEPTH_BINS, FAR_M, shutter_turning_rad_per_s
 from weather_aug.particles.shelter import Shelter
 from weather_aug.render.fields import (
@@ -37,8 +37,7 @@ from weather_aug.render.medium import SPRAY_HEIGHT_M, Medium, Optics, optical_de
 from weather_aug.render.options import RenderOptions
 from weather_aug.render.project import BAND_ROWS, split_by_band
 from weather_aug.render.scattering import scattered_background
-from weather_aug.render.shade import Tone, shade
-from weather_aug.render.surface import Surface, depth_of, repainted, ring_of
+from weather_aug.render.shade import shade
 from weather_aug.weather import Weather
 
 Float32 = NDArray[np.float32]
@@ -70,30 +69,12 @@ class _Air(NamedTuple):
     patches: FogVolume
 
 
-class _Look(NamedTuple):
-    """How recorded colours change."""
-
-    curve: Float64
-    """(256,) light by sRGB level."""
-    matrix: Float64
-    """(3, 3) of colours after it."""
-    overcast: float
-    veil: float | None = None
-    """Grey in sRGB that hides surfaces: colours then stay in sRGB. Else it is the airlight, and
-    light is linear."""
-
-    def contrast(self, airlight: Float64) -> tuple[Float64, float]:
-        """Colour (3,) that hides surfaces, and the least difference from it that can be seen."""
-        if self.veil is None:
-            return airlight, least_linear_contrast(airlight)
-        return np.full(3, self.veil), LEAST_CONTRAST_LEVELS / 255
-
-
 @dataclass(frozen=True, eq=False)
 class Stage:
     """A window of a picture, its camera, its weather and its light."""
 
     surface: Surface
+    """With the weather's background in the window."""
     window: Window
     camera: Camera
     """Of the whole picture."""
@@ -106,7 +87,7 @@ class Stage:
     def shaded(
         self, fields: Sequence[ParticleField], shelter: Shelter | None, time_s: float
     ) -> Planes:
-        """The window with the weather's sky, medium and particles."""
+        """The window with the weather's medium and particles."""
         weather = self.weather
         resolved, carried = resolved_of(fields, self.camera, self.options.max_particles)
         medium = medium_of(weather, fields, self.ambience)
@@ -123,16 +104,11 @@ class Stage:
             self.window,
             shelter,
         )
-        if self.options.multiple_scattering:
-            plain = _Look(SRGB_LEVELS_LINEAR, np.eye(3), 0.0)
-            return self._run(self._scattered(air), air, plain, splats)
-        return self._run(self.surface, air, self._look, splats)
+        surface = self._scattered(air) if self.options.multiple_scattering else self.surface
+        return self._run(surface, air, splats)
 
     def published(self, rig: RigMotion, time_s: float) -> Planes:
-        """The window with the weather's sky and the particles of WeatherEdit's release.
-
-        First the background, then the particles over it, blended as they are stored: in sRGB.
-        """
+        """The window with the particles of WeatherEdit's release, blended in sRGB."""
         splats = published_splats(
             self.camera,
             time_s,
@@ -144,10 +120,8 @@ class Stage:
             self._optics,
             self.window,
         )
-        # What hides a surface here is the release's grey, and colours differ in sRGB.
         grey = published_grey(self.weather, self.options)
-        encoded = _Look(np.arange(256) / 255, np.eye(3), 0.0, grey)
-        return self._run(self._background(), self._clear_air, encoded, splats)
+        return self._run(self.surface, self._clear_air, splats, grey)
 
     @cached_property
     def _optics(self) -> Optics:
@@ -158,36 +132,44 @@ class Stage:
         return fog_volume_of(self.weather, self.camera, self.window, self.seed, self.air, axes)
 
     @property
-    def _look(self) -> _Look:
-        """How recorded colours change under the weather's sky."""
-        return _Look(*tone(self.weather.overcast), self.weather.overcast)
-
-    @property
     def _clear_air(self) -> _Air:
         medium = medium_of(Weather(), (), self.ambience)
         return _Air(medium, np.zeros(DEPTH_BINS + 1, np.float32), even_fog())
-
-    def _background(self) -> Surface:
-        """The surface under the weather's sky, without anything in the air."""
-        shot = self._run(self.surface, self._clear_air, self._look, np.empty((0, 16), np.float32))
-        return repainted(self.surface, shot.image, self.window)
 
     def _scattered(self, air: _Air) -> Surface:
         """The background with what lies behind thick air blurred."""
         depth = depth_of(self.surface, self.window)
         tau = optical_depth(depth, self.window, self._optics, *air)
-        shape = (*self.window[2:], 3)
-        image = self._background().image.reshape(shape)
-        blurred = scattered_background(image, tau, max(self.camera.focal_px))
+        blurred = scattered_background(self._image(), tau, max(self.camera.focal_px))
         return repainted(self.surface, blurred, self.window)
 
-    def _run(self, surface: Surface, air: _Air, look: _Look, splats: Float32) -> Planes:
-        """Allocate what the kernel writes, and run it."""
+    def _image(self) -> UInt8:
+        """(H, W, 3) of the window."""
+        top, left, rows, columns = self.surface.image_window
+        y, x = self.window[0] - top, self.window[1] - left
+        whole = self.surface.image.reshape(rows, columns, 3)
+        return whole[y : y + self.window[2], x : x + self.window[3]]
+
+    def _run(
+        self, surface: Surface, air: _Air, splats: Float32, veil: float | None = None
+    ) -> Planes:
+        """Allocate what the kernel writes, and run it.
+
+        Args:
+            surface: The background.
+            air: What is in front of it.
+            splats: Particles.
+            veil: Grey in sRGB that hides surfaces: colours are then blended in sRGB. Else it is
+                the airlight that does, and light is linear.
+        """
         _, _, height, width = self.window
         splats, band_starts = split_by_band(splats, self.window, -(-height // BAND_ROWS))
-        sky_luminance = max(float(self.ambience.sky @ LUMINANCE), 0.05)
-        sky = (look.overcast, sky_luminance, ZENITH_GAIN, look.veil is not None)
-        veil, contrast = look.contrast(self.ambience.airlight)
+        if veil is None:
+            linear, hiding = SRGB_LEVELS_LINEAR, self.ambience.airlight
+            contrast = least_linear_contrast(hiding)
+        else:
+            linear, hiding = np.arange(256) / 255, np.full(3, veil)
+            contrast = LEAST_CONTRAST_LEVELS / 255
         limits = (contrast, HAZY_TRANSMITTANCE)
         levels = np.empty((3, height, (width + 15) // 16 * 16), np.uint8)
         through = np.empty((height, width), np.float32)
@@ -195,16 +177,14 @@ class Stage:
         covered = np.zeros((height, width), np.uint8)
         hazy_count = shade(
             surface,
-            ring_of(surface, self.window),
             air.patches,
             self.window,
             self._optics,
             air.medium,
             air.carried,
-            look.curve.astype(np.float32),
-            look.matrix.astype(np.float32),
-            Tone(*(np.float32(v) for v in sky)),
-            veil.astype(np.float32),
+            linear.astype(np.float32),
+            veil is not None,
+            hiding.astype(np.float32),
             splats,
             band_starts,
             tuple(np.float32(v) for v in limits),

@@ -8,10 +8,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from weather_aug.clip.types import Clip, Frame, FrameKey
+from weather_aug.clip.types import Clip, Frame, FrameKey, Window
 from weather_aug.edit.ambience import Ambience
 from weather_aug.errors import ArgumentError, IntegrityError, printable
-from weather_aug.particles.field import Window
 from weather_aug.particles.shelter import Shelter
 from weather_aug.render.compose import RenderedFrame, render
 from weather_aug.render.fields import RigMotion

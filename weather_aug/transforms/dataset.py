@@ -13,8 +13,8 @@ import torch
 from torch.utils.data import Dataset, get_worker_info
 
 from weather_aug._keys import check_seed, key_of, uniforms
+from weather_aug.clip.types import Window
 from weather_aug.errors import ArgumentError
-from weather_aug.particles.field import Window
 from weather_aug.render.compose import RenderedFrame, warm_up
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene.policy import WeatherDraw, WeatherPolicy

@@ -10,6 +10,7 @@ from weather_aug.colour import LUMINANCE, SRGB_LEVELS_LINEAR
 Float64 = NDArray[np.float64]
 
 MIDDLE_GREY = 0.18
+CONTRAST_LOSS = 0.25
 ZENITH_GAIN = 0.6
 """An overcast sky is 1 + this times as bright overhead as at the horizon, where it has the
 airlight's colour; less than the CIE's 3, because the camera exposes for the street and clips."""
@@ -31,7 +32,7 @@ def tone(overcast: float) -> tuple[Float64, Float64]:
         colour matrix (3, 3) to apply after it.
     """
     light = SRGB_LEVELS_LINEAR
-    contrast = 1.0 - 0.25 * overcast
+    contrast = 1.0 - CONTRAST_LOSS * overcast
     gain = 1.0 - 0.15 * overcast * (1.0 - 0.8)
     curve = gain * MIDDLE_GREY * (light / MIDDLE_GREY) ** contrast if overcast else light
     saturation = 1.0 - 0.35 * overcast

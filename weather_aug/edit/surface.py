@@ -9,20 +9,16 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug._compiled import compiled
-from weather_aug.clip.types import FAR_DEPTH_M, Frame
-from weather_aug.particles.field import Window
+from weather_aug.clip.types import FAR_DEPTH_M, Frame, Window
+from weather_aug.errors import ArgumentError
 from weather_aug.taxonomy import SKY
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
-
-RING_PX = 7
-"""Where only depth tells of the sky, it may show this far around what is far."""
 
 
 class Surface(NamedTuple):
@@ -62,6 +58,23 @@ def surface_of(frame: Frame) -> Surface:
     )
 
 
+def checked_window(window: Window | None, height: int, width: int) -> Window:
+    """`window` as integers, or the whole picture; refuse one that leaves the picture."""
+    if window is None:
+        return (0, 0, height, width)
+    try:
+        top, left, rows, columns = (v.__index__() for v in window)
+    except (AttributeError, TypeError, ValueError):
+        raise ArgumentError(
+            f"window must be four integers (top, left, height, width), got {window!r}"
+        ) from None
+    if not (0 <= top and 0 <= left and rows > 0 and columns > 0):
+        raise ArgumentError(f"window {window} must be (top >= 0, left >= 0, height > 0, width > 0)")
+    if top + rows > height or left + columns > width:
+        raise ArgumentError(f"window {window} leaves the picture of {height}x{width} pixels")
+    return (top, left, rows, columns)
+
+
 def repainted(surface: Surface, image: UInt8, window: Window) -> Surface:
     """The same surface with another picture (H, W, 3) of one window of it."""
     return surface._replace(image=_flat(image, 3), image_window=window)
@@ -72,19 +85,6 @@ def depth_of(surface: Surface, window: Window) -> Float32:
     out = np.empty(window[2:], np.float32)
     _fill_depth(surface, window, out.view(np.int32), out)
     return out
-
-
-def ring_of(surface: Surface, window: Window) -> NDArray[np.bool_]:
-    """Where the sky may show though nobody labelled it, (H, W); empty where there are labels.
-
-    That is what is far, and the ring around it, which depth sensors miss. Inside only pixels as
-    bright as the sky are taken for it, so that the ring costs nothing where the edge was right.
-    """
-    if len(surface.label):
-        return np.empty((0, 0), np.bool_)
-    far = (depth_of(surface, window) == np.inf).astype(np.uint8)
-    ringed: NDArray[np.bool_] = cv2.dilate(far, np.ones((RING_PX, RING_PX), np.uint8)).astype(bool)
-    return ringed
 
 
 @compiled

@@ -1,0 +1,48 @@
+"""Arithmetic of whole rows of pixels that the editor and the renderer share. Compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from weather_aug._compiled import compiled
+
+
+@compiled
+def survival(optical_depth):
+    """exp(-x) for x in [-16, 80] to 2e-5, in operations that give equal bits on every machine."""
+    x = optical_depth * np.float32(-0.015625)
+    one = np.float32(1.0)
+    p = one + x * np.float32(1.0 / 6.0)
+    p = one + x * np.float32(0.2) * p
+    p = one + x * np.float32(0.25) * p
+    p = one + x * np.float32(1.0 / 3.0) * p
+    p = one + x * np.float32(0.5) * p
+    p = one + x * p
+    p = p * p
+    p = p * p
+    p = p * p
+    p = p * p
+    p = p * p
+    return p * p
+
+
+@compiled
+def encode_row(light, out):
+    """Turn linear light into sRGB levels, rounded, with an error of 0.1 of a level before that.
+
+    A polynomial in the square root on the power branch (largest error 0.083 levels), the exact
+    line below it; every 8-bit level survives decoding and encoding.
+    """
+    zero, one = np.float32(0.0), np.float32(1.0)
+    for x in range(light.shape[0]):
+        v = light[x]
+        v = v if v > zero else zero
+        v = v if v < one else one
+        s = np.sqrt(v)
+        p = np.float32(-1.6236571) + s * np.float32(0.5173023)
+        p = np.float32(2.0315735) + s * p
+        p = np.float32(-1.4027363) + s * p
+        p = np.float32(1.5179509) + s * p
+        p = np.float32(-0.0401096) + s * p
+        p = p if v > np.float32(0.0031308) else np.float32(12.92) * v
+        out[x] = np.uint8(np.int32(p * np.float32(255.0) + np.float32(0.5)))

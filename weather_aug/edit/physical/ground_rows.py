@@ -1,0 +1,223 @@
+"""Water and snow on a run of ground pixels. Compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from weather_aug._compiled import inlined
+from weather_aug.edit.physical.materials import COVER, MIRROR, POROSITY, ROAD
+from weather_aug.edit.physical.noise import ground_noise
+from weather_aug.edit.physical.spread import spread_run
+
+R, G, B = range(3)
+LIGHT, LATERAL, SHARP, ROUGH = 4, 7, 8, 11
+ALONG, LEFT, SINE, SIZE, NOISE, LIT, SIDE, COVERED, POOL, MIRRORED = *range(6, 15), 15
+"""Rows of the buffer that a run uses; the mirrored light takes six from MIRRORED on."""
+
+LANE_M, WHEEL_M, TRACK_M = 3.5, 0.75, 0.28
+"""Width of a lane, wheels from its middle, half the width of a track."""
+SNOW_ALBEDO, ASPHALT_ALBEDO = 0.85, 0.12
+FILM_OUT, FILM_BACK = 0.066, 0.475
+"""Share of light that a film of water turns back from above, and from below (n = 1.333)."""
+MICRO_SLOPE = 0.25
+"""Root mean square slope of the stones that stick out of a film, radians."""
+
+
+@inlined
+def ramp(low, high, value):
+    """Smooth step from 0 at `low` to 1 at `high`."""
+    t = (value - low) / (high - low)
+    t = t if t > np.float32(0.0) else np.float32(0.0)
+    t = t if t < np.float32(1.0) else np.float32(1.0)
+    return t * t * (np.float32(3.0) - np.float32(2.0) * t)
+
+
+@inlined
+def covered(amount, fuzz, noise):
+    """How far a place of this noise is covered when a share `amount` of all places is."""
+    one = np.float32(1.0)
+    threshold = one + fuzz - amount * (one + np.float32(2.0) * fuzz)
+    return ramp(threshold - fuzz, threshold + fuzz, noise)
+
+
+@inlined
+def fresnel_of_sine(s):
+    one = np.float32(1.0)
+    t = one - s
+    return np.float32(0.02) + np.float32(0.98) * t * t * t * t * t
+
+
+@inlined
+def film_ratio(albedo):
+    """Albedo under a film of water over the dry one (Lekner and Dorf 1988)."""
+    one = np.float32(1.0)
+    through = (one - np.float32(FILM_OUT)) * (one - np.float32(FILM_BACK))
+    return through / (one - np.float32(FILM_BACK) * albedo)
+
+
+@inlined
+def ground_run(run, depth, geometry, look, material, small, cell, share, tile, b):
+    """Wet and snow on pixels x0 to x1 of one ground class.
+
+    Args:
+        run: (x0, x1, left, y): pixels of the window's row, and where its row starts in the picture.
+        depth: (W,) metres.
+        geometry: Of the whole picture.
+        look: Weather.
+        material: (8,) of the class.
+        small: (14, w) maps at this row.
+        cell: (W,) for `spread_run`.
+        share: (W,) for `spread_run`.
+        tile: Noise.
+        b: Buffer; its first three rows are the light.
+    """
+    x0, x1, _, _ = run
+    zero = np.float32(0.0)
+    road = material[ROAD] > zero
+    amount = look.road_snow if road else look.snow * material[COVER]
+    pools = look.puddles if road else zero
+    shine = look.mirror * material[MIRROR]
+    _places(run, depth, geometry, b)
+    spread_run(small, LIGHT, 1, cell, share, x0, x1, b, LIT)
+    if amount > zero or pools > zero:
+        for x in range(x0, x1):
+            b[NOISE, x] = ground_noise(tile, b[ALONG, x], b[LEFT, x], b[SIZE, x], zero)
+        spread_run(small, LATERAL, 1, cell, share, x0, x1, b, SIDE)
+        _tracks(x0, x1, look.tracks if road else zero, b)
+    if look.film > zero:
+        film(x0, x1, look.film * material[POROSITY], LIT, b)
+    if shine > zero:
+        spread_run(small, SHARP, 6, cell, share, x0, x1, b, MIRRORED)
+        if pools > zero:
+            for x in range(x0, x1):
+                lie = ground_noise(tile, b[ALONG, x], b[LEFT, x], b[SIZE, x], np.float32(11.3))
+                more = np.float32(1.0) + np.float32(1.5) * b[SIDE, x]
+                b[POOL, x] = covered(pools * more, _fuzz(b[SIZE, x]), lie)
+        else:
+            for x in range(x0, x1):
+                b[POOL, x] = zero
+        _mirror(x0, x1, shine, look.flooded, b)
+    if amount > zero:
+        _cover(x0, x1, amount, b)
+        _lay(x0, x1, look, b)
+
+
+@inlined
+def _fuzz(size_m):
+    """How soft the border of a patch is at a pixel of this size."""
+    soft = np.float32(0.07) + np.float32(0.25) * size_m
+    return soft if soft < np.float32(0.5) else np.float32(0.5)
+
+
+@inlined
+def _places(run, depth, geometry, b):
+    """Where the pixels are on the street, how flat they are seen, and how large they are."""
+    x0, x1, left, y = run
+    one, steepest = np.float32(1.0), np.float32(0.004)
+    ray_y = (np.float32(y) - geometry.cy) / geometry.fy
+    along_y = geometry.along_y * ray_y + geometry.along_z
+    left_y = geometry.left_y * ray_y + geometry.left_z
+    climb_y = geometry.climb_y * ray_y + geometry.climb_z
+    per_fx, per_fy = one / geometry.fx, one / geometry.fy
+    across = one + ray_y * ray_y
+    for x in range(x0, x1):
+        z = depth[x]
+        z = z if z < np.float32(1e4) else np.float32(1e4)
+        ray_x = (np.float32(left + x) - geometry.cx) * per_fx
+        b[ALONG, x] = geometry.along_0 + z * (geometry.along_x * ray_x + along_y)
+        b[LEFT, x] = geometry.left_0 + z * (geometry.left_x * ray_x + left_y)
+        sine = -(geometry.climb_x * ray_x + climb_y) / np.sqrt(across + ray_x * ray_x)
+        sine = sine if sine > steepest else steepest
+        b[SINE, x] = sine
+        b[SIZE, x] = z * per_fy / (sine if sine > np.float32(0.02) else np.float32(0.02))
+
+
+@inlined
+def _tracks(x0, x1, strength, b):
+    """From how far left of the way to how far in a wheel's track; other lanes are driven less."""
+    one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
+    for x in range(x0, x1):
+        side = b[SIDE, x] + half * (b[NOISE, x] - half)
+        lane = np.floor(side * np.float32(1.0 / LANE_M) + half)
+        off = abs(abs(side - np.float32(LANE_M) * lane) - np.float32(WHEEL_M))
+        track = one - ramp(np.float32(0.5 * TRACK_M), np.float32(1.5 * TRACK_M), off)
+        driven = one - np.float32(0.45) * abs(lane)
+        b[SIDE, x] = strength * track * (driven if driven > zero else zero)
+
+
+@inlined
+def film(x0, x1, wet, lit, b):
+    """Darken a run under a film of water; row `lit` of the buffer is the light on it."""
+    least, most, one = np.float32(0.01), np.float32(0.95), np.float32(1.0)
+    for x in range(x0, x1):
+        bare = one / max(b[lit, x], np.float32(0.02))
+        for channel in range(3):
+            value = b[channel, x]
+            albedo = value * bare
+            albedo = albedo if albedo > least else least
+            albedo = albedo if albedo < most else most
+            b[channel, x] = value * (one + wet * (film_ratio(albedo) - one))
+
+
+@inlined
+def _mirror(x0, x1, shine, flooded_share, b):
+    """What the film and the puddles mirror."""
+    one = np.float32(1.0)
+    slope2 = np.float32(MICRO_SLOPE * MICRO_SLOPE)
+    for x in range(x0, x1):
+        sine, pool = b[SINE, x], b[POOL, x]
+        flooded = flooded_share + pool * (one - flooded_share)
+        rough = fresnel_of_sine(np.sqrt(sine * sine + slope2))
+        stones = shine * (one - flooded) * np.float32(0.5) * rough
+        calm = shine * flooded * fresnel_of_sine(sine)
+        kept = (one - stones - calm) * (one - np.float32(0.2) * pool)
+        for channel in range(3):
+            sharp, smeared = b[MIRRORED + channel, x], b[MIRRORED + 3 + channel, x]
+            sharp = smeared + pool * (sharp - smeared)
+            b[channel, x] = kept * b[channel, x] + stones * smeared + calm * sharp
+
+
+@inlined
+def _cover(x0, x1, amount, b):
+    one = np.float32(1.0)
+    for x in range(x0, x1):
+        spared = amount * (one - np.float32(0.85) * b[SIDE, x])
+        b[COVERED, x] = covered(spared, _fuzz(b[SIZE, x]), b[NOISE, x])
+
+
+@inlined
+def _lay(x0, x1, look, b):
+    """Snow over what lies there; a little of it shows through."""
+    asphalt = np.float32(ASPHALT_ALBEDO)
+    grey = luminance(look.red, look.green, look.blue)
+    for x in range(x0, x1):
+        light = b[LIT, x]
+        bright = snow_light(light, look)
+        under = luminance(b[R, x], b[G, x], b[B, x]) / (asphalt * light)
+        under = under if under < np.float32(2.0) else np.float32(2.0)
+        shade = np.float32(0.90) + np.float32(0.12) * b[NOISE, x]
+        shade *= np.float32(0.95) + np.float32(0.05) * under
+        lay_snow(x, b[COVERED, x], bright * shade / grey, look, b)
+
+
+@inlined
+def luminance(red, green, blue):
+    """Of linear light."""
+    return np.float32(0.2126) * red + np.float32(0.7152) * green + np.float32(0.0722) * blue
+
+
+@inlined
+def snow_light(light, look):
+    """Luminance of snow under this light, as the camera exposes it."""
+    bright = np.float32(SNOW_ALBEDO) * light * look.exposure
+    least = np.float32(0.62) * look.snow_light
+    bright = bright if bright > least else least
+    return bright if bright < look.snow_light else look.snow_light
+
+
+@inlined
+def lay_snow(x, cover, white, look, b):
+    """Blend snow of `white` times the airlight's colour over one pixel."""
+    b[R, x] += cover * (look.red * white - b[R, x])
+    b[G, x] += cover * (look.green * white - b[G, x])
+    b[B, x] += cover * (np.float32(1.02) * look.blue * white - b[B, x])

@@ -1,0 +1,1 @@
+"""What weather did to a picture, measured: steadiness over time and views, a network's labels."""

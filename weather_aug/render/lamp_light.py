@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from weather_aug._checks import image_uint8, like_image
 from weather_aug._compiled import compiled, inlined
+from weather_aug._rows import survival
+from weather_aug.clip.types import Window
 from weather_aug.colour import SRGB_LEVELS_LINEAR
 from weather_aug.errors import ArgumentError
-from weather_aug.particles.field import Window
-from weather_aug.render.medium import survival
 
 UInt8 = NDArray[np.uint8]
 

@@ -15,7 +15,7 @@ from PIL import Image
 
 from weather_aug.clip.dgp import DgpClip
 from weather_aug.clip.open import open_clip
-from weather_aug.clip.types import Box, Clip
+from weather_aug.clip.types import Box, Clip, FrameKey
 from weather_aug.errors import ArgumentError, CalibrationError, ClipError
 
 DATA = Path(__file__).resolve().parents[2] / ".." / "shared" / "data" / "dgp-ddad"
@@ -66,6 +66,56 @@ def test_boxes_hold_the_points_that_were_counted_in_them() -> None:
     assert np.median(share) == pytest.approx(0.2, abs=0.02)
     assert share.min() > 0.08 and share.max() < 0.25
     assert {"Car"} <= {box.class_name for box in boxes}
+
+
+@needs_data
+def test_tracked_cars_drive_the_way_they_look() -> None:
+    clip = DgpClip(DATA, scene="scene_02", scale=0.1)
+    speeds = []
+    for key in clip.keys[::6]:
+        for box in clip.frame(key).boxes:
+            if box.class_name != "Car" or box.velocity_m_per_s is None:
+                continue
+            speed = float(np.linalg.norm(box.velocity_m_per_s))
+            speeds.append(speed)
+            if speed > 2:
+                assert box.velocity_m_per_s @ box.world_from_box[:3, 0] > 0.98 * speed
+    assert len(speeds) > 20 and min(speeds) < 0.2 and 10 < max(speeds) < 30
+
+
+def _shifted(ahead_m: float) -> dict[str, Any]:
+    """The sweep's pose of the first moment, moved on."""
+    place = UNIT_POSE["translation"]
+    return {**UNIT_POSE, "translation": {**place, "x": place["x"] + ahead_m}}
+
+
+def _second_sweep(cloud: str, pose: Any) -> Callable[[Any], None]:
+    """A sweep of its own for the second moment, 0.1 s later, whose sensor has moved on."""
+
+    def apply(description: Any) -> None:
+        first = description["data"][-1]
+        second = copy.deepcopy(first) | {"key": cloud}
+        second["datum"]["point_cloud"]["pose"] = pose
+        second["id"]["timestamp"] = description["data"][1]["id"]["timestamp"]
+        description["data"].append(second)
+        description["samples"][1]["datum_keys"][1] = cloud
+
+    return apply
+
+
+def test_velocity_is_from_where_the_track_is_around_it(tmp_path: Path) -> None:
+    pose = _shifted(1.2)
+    clip = DgpClip(_written(tmp_path, _second_sweep("later", pose)))
+    for key in clip.keys:
+        (box,) = clip.frame(key).boxes
+        np.testing.assert_allclose([12.0, 0.0, 0.0], box.velocity_m_per_s, atol=1e-4)
+
+
+def test_velocity_of_one_moment_or_of_a_jump_is_unknown(tmp_path: Path) -> None:
+    (box,) = DgpClip(_written(tmp_path / "one")).frame(FrameKey(0, "CAM")).boxes
+    assert box.velocity_m_per_s is None
+    clip = DgpClip(_written(tmp_path / "jump", _second_sweep("later", _shifted(80.0))))
+    assert clip.frame(FrameKey(0, "CAM")).boxes[0].velocity_m_per_s is None
 
 
 @needs_data

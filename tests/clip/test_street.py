@@ -252,6 +252,21 @@ def test_traffic_moves_and_parked_cars_do_not(clip: StreetClip) -> None:
     assert all(before[t].class_name == after[t].class_name for t in shared)
 
 
+def test_velocities_of_boxes_are_the_derivatives_of_their_places(clip: StreetClip) -> None:
+    before, now, after = (
+        {box.track_id: box for box in clip.frame(FrameKey(t, "front")).boxes} for t in (3, 4, 5)
+    )
+    shared = before.keys() & now.keys() & after.keys()
+    assert len(shared) > 10
+    for track in shared:
+        places = [boxes[track].world_from_box[:3, 3] for boxes in (before, after)]
+        moved = (places[1] - places[0]) / 0.2
+        # The street bends: a central difference over 0.2 s is off by a few mm/s.
+        np.testing.assert_allclose(moved, now[track].velocity_m_per_s, atol=0.01)
+    speeds = [float(np.linalg.norm(now[track].velocity_m_per_s)) for track in shared]
+    assert min(speeds) == 0.0 and max(speeds) > 8.0
+
+
 def test_points_of_tracked_classes_lie_in_their_boxes(frames: dict[FrameKey, Frame]) -> None:
     frame = frames[FrameKey(0, "front")]
     for name in ("car", "person", "bus", "truck"):

@@ -17,7 +17,7 @@ import pytest
 from tiny_clip import TinyClip, digests_of
 
 from weather_aug import _files
-from weather_aug.clip.types import Float64, Frame, FrameKey
+from weather_aug.clip.types import Box, Float64, Frame, FrameKey
 from weather_aug.edit.ambience import ambience_of
 from weather_aug.errors import (
     ArgumentError,
@@ -96,6 +96,32 @@ def test_two_builds_give_the_same_bytes(tiny_scene: WeatherScene, out: Path) -> 
     again = WeatherScene.build(TinyClip(), out)
     assert digests_of(out) == digests_of(tiny_scene.path)
     assert again.digest == tiny_scene.digest
+
+
+@dataclass(frozen=True)
+class Busy(TinyClip):
+    """The tiny street with a car ahead."""
+
+    def frame(self, key: FrameKey) -> Frame:
+        pose = np.eye(4)
+        pose[:3, 3] = (20.0 + key.time_index, 0.0, 0.75)
+        car = Box(5, "car", pose, (4.4, 1.8, 1.5), np.array([10.0, 0.0, 0.0]))
+        return replace(super().frame(key), boxes=(car,))
+
+
+def test_boxes_are_built_into_the_scene(out: Path, tmp_path: Path) -> None:
+    clip = Busy(frames=2)
+    scene = WeatherScene.build(clip, out)
+    for key in clip.keys:
+        (clean,), (stored,) = clip.frame(key).boxes, scene.frame(key).boxes
+        assert (stored.track_id, stored.class_name, stored.size_m) == (5, "car", (4.4, 1.8, 1.5))
+        assert (stored.world_from_box == clean.world_from_box).all()
+        assert stored.velocity_m_per_s.tolist() == [10.0, 0.0, 0.0]
+    again = WeatherScene.build(clip, tmp_path / "again")
+    assert digests_of(again.path) == digests_of(scene.path)
+    path = next(scene.path.rglob("*boxes.json"))
+    path.write_bytes(path.read_bytes().replace(b"20.0", b"30.0"))
+    assert ["boxes.json" in problem for problem in scene.damaged_files()] == [True]
 
 
 def test_time_starts_at_zero(out: Path) -> None:

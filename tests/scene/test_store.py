@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from tiny_clip import TinyClip, digests_of
 
 from weather_aug import _files
-from weather_aug.clip.types import FrameKey
+from weather_aug.clip.types import Box, Frame, FrameKey
 from weather_aug.edit.ambience import Ambience
 from weather_aug.errors import DataError, IntegrityError, SceneError, WeatherAugError
 from weather_aug.scene import store
+from weather_aug.scene.boxes import MAX_BOXES, MAX_BOXES_BYTES, read_boxes
 from weather_aug.scene.scene import WeatherScene
 
 FIRST = "frames/000000_front"
@@ -112,6 +113,123 @@ def test_a_label_of_another_taxonomy_is_refused(tiny_clip: TinyClip) -> None:
         store.encode_frame(replace(frame, label=label))
     label[3, 3] = 255
     assert store.encode_frame(replace(frame, label=label))
+
+
+def boxed(clip: TinyClip, boxes: tuple[Box, ...]) -> Frame:
+    return replace(clip.frame(clip.keys[0]), boxes=boxes)
+
+
+def some_boxes() -> tuple[Box, ...]:
+    pose = np.eye(4)
+    pose[:3, 3] = (12.0, 1.0 / 3.0, 0.75)
+    car = Box(2**40 + 7, "Bus/RV/Caravan", pose, (4.5, 1.8, 1.5), np.array([8.0, 0.1, 0.0]))
+    return car, Box(-3, "person", np.eye(4), (0.5, 0.5, 1.7))
+
+
+def test_boxes_come_back_as_they_went_in(tiny_clip: TinyClip, tmp_path: Path) -> None:
+    data = store.encode_frame(boxed(tiny_clip, some_boxes()))["boxes"]
+    assert data == store.encode_frame(boxed(tiny_clip, some_boxes()))["boxes"]
+    path = tmp_path / "boxes.json"
+    path.write_bytes(data)
+    stored = read_boxes(path)
+    assert len(stored) == 2
+    for clean, back in zip(some_boxes(), stored, strict=True):
+        assert (clean.track_id, clean.class_name) == (back.track_id, back.class_name)
+        assert clean.size_m == back.size_m
+        assert clean.world_from_box.tobytes() == back.world_from_box.tobytes()
+    assert stored[0].velocity_m_per_s is not None and stored[1].velocity_m_per_s is None
+    assert stored[0].velocity_m_per_s.tolist() == [8.0, 0.1, 0.0]
+    assert not stored[0].world_from_box.flags.writeable
+
+
+def test_a_frame_without_boxes_has_no_file_of_them(
+    tiny_clip: TinyClip, tiny_scene: WeatherScene
+) -> None:
+    assert not list(tiny_scene.path.rglob("*boxes*"))
+    assert tiny_scene.frame(tiny_scene.keys[0]).boxes == ()
+    assert "boxes" not in store.encode_frame(tiny_clip.frame(tiny_clip.keys[0]))
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        Box(1, "a\nb", np.eye(4), (1, 1, 1)),
+        Box(1, "", np.eye(4), (1, 1, 1)),
+        Box(1, "x" * 65, np.eye(4), (1, 1, 1)),
+        Box(2**64, "car", np.eye(4), (1, 1, 1)),
+        Box(1, "car", np.eye(4), (1, 1, 1e11)),
+    ],
+)
+def test_a_box_that_no_scene_holds_is_refused(tiny_clip: TinyClip, box: Box) -> None:
+    with pytest.raises(SceneError, match="000000_front: a box cannot be stored"):
+        store.encode_frame(boxed(tiny_clip, (box,)))
+
+
+def test_the_largest_frame_of_boxes_can_be_read(tiny_clip: TinyClip, tmp_path: Path) -> None:
+    pose = np.eye(4)
+    pose[:3, 3] = -1.0 / 3e-5
+    worst = Box(2**64 - 1, "\U0001f697" * 64, pose, (1 / 3,) * 3, np.full(3, -1 / 3e2))
+    path = tmp_path / "boxes.json"
+    path.write_bytes(store.encode_frame(boxed(tiny_clip, (worst,) * MAX_BOXES))["boxes"])
+    assert path.stat().st_size < MAX_BOXES_BYTES
+    assert len(read_boxes(path)) == MAX_BOXES
+    with pytest.raises(SceneError, match=f"{MAX_BOXES + 1} boxes"):
+        store.encode_frame(boxed(tiny_clip, (worst,) * (MAX_BOXES + 1)))
+
+
+def _spoilt(**changes: Any) -> Any:
+    entry = {
+        "track_id": 1,
+        "class_name": "car",
+        "world_from_box": np.eye(4).tolist(),
+        "size_m": [1.0, 1.0, 1.0],
+        "velocity_m_per_s": None,
+    }
+    return {"boxes": [entry | changes]}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        [],
+        {},
+        {"boxes": {}},
+        {"boxes": [7]},
+        {"boxes": [{}]},
+        {"boxes": [_spoilt()["boxes"][0]] * (MAX_BOXES + 1)},
+        _spoilt(track_id="7"),
+        _spoilt(track_id=2**70),
+        _spoilt(class_name=7),
+        _spoilt(class_name="\x1b[2J"),
+        _spoilt(world_from_box=[[1e300] * 4] * 4),
+        _spoilt(world_from_box=np.diag([1.0, 1.0, -1.0, 1.0]).tolist()),
+        _spoilt(size_m=[1.0, 1.0]),
+        _spoilt(size_m=[1.0, 1.0, -1.0]),
+        _spoilt(size_m="car"),
+        _spoilt(velocity_m_per_s=[1e9, 0.0, 0.0]),
+        _spoilt(velocity_m_per_s=[0.0]),
+    ],
+)
+def test_malformed_boxes_are_refused(tmp_path: Path, content: Any) -> None:
+    path = tmp_path / "boxes.json"
+    path.write_text(json.dumps(_spoilt()))
+    assert len(read_boxes(path)) == 1
+    path.write_text(json.dumps(content))
+    with pytest.raises(SceneError, match=r"boxes\.json holds no boxes.*build the scene again"):
+        read_boxes(path)
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"{", b"\xff", b'{"boxes": NaN}', b" " * MAX_BOXES_BYTES * 2]
+)
+def test_a_file_that_is_no_json_holds_no_boxes(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "boxes.json"
+    path.write_bytes(data)
+    with pytest.raises(SceneError, match="holds no boxes"):
+        read_boxes(path)
+    path.unlink()
+    with pytest.raises(SceneError, match="holds no boxes"):
+        read_boxes(path)
 
 
 @pytest.mark.parametrize("time_s", [np.nan, np.inf, 1e11])

@@ -34,7 +34,14 @@ from weather_aug.clip.records import (
     scaled_size,
     shown,
 )
-from weather_aug.clip.types import Box, Camera, Frame, FrameKey, check_key
+from weather_aug.clip.types import (
+    MAX_SPEED_M_PER_S,
+    Box,
+    Camera,
+    Frame,
+    FrameKey,
+    check_key,
+)
 from weather_aug.errors import ArgumentError, CalibrationError, ClipError, printable
 
 _BOXES_3D = "1"
@@ -45,6 +52,7 @@ _FIRST_IMPOSSIBLE_YEAR = 2200
 class _Sweep:
     """A LiDAR sweep: its points, its pose, its boxes."""
 
+    time_s: float
     points_path: Path
     world_from_lidar: Float64
     boxes_path: Path | None
@@ -58,6 +66,8 @@ class _Shot:
     time_s: float
     camera: Camera
     sweep: _Sweep | None
+    others: tuple[_Sweep, ...] = ()
+    """Sweeps of the samples before and after."""
 
 
 class DgpClip:
@@ -129,7 +139,7 @@ class DgpClip:
         camera_from_world = inverse_motion(camera.world_from_camera)
         points_camera = points_world @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
         depth_m = read_only(lidar_depth(points_camera, camera.intrinsics, image))
-        boxes = _boxes(shot.sweep, self._class_names)
+        boxes = _boxes(shot.sweep, shot.others, self._class_names)
         return Frame(key, shot.time_s, camera, image, depth_m=depth_m, boxes=boxes)
 
 
@@ -164,9 +174,11 @@ def _shots(scene: Record, folder: Path) -> dict[tuple[int, str], _Shot]:
         raise scene["samples"].fault("is empty")
     start = min(_microseconds(item["id"]["timestamp"]) for item in data.values())
     shots: dict[tuple[int, str], _Shot] = {}
+    sweeps: list[_Sweep | None] = []
     for index, sample in enumerate(samples):
         members = [_datum(key, data) for key in sample["datum_keys"]]
-        sweep = _sweep(members, folder)
+        sweep = _sweep(members, folder, start)
+        sweeps.append(sweep)
         intrinsics = _intrinsics(folder, sample["calibration_key"])
         for member in members:
             picture = member["datum"].get("image")
@@ -181,7 +193,27 @@ def _shots(scene: Record, folder: Path) -> dict[tuple[int, str], _Shot]:
             shots[index, name] = _Shot(path, time_s, camera, sweep)
     if not shots:
         raise scene["data"].fault("holds no picture")
-    return _moving(shots)
+    return _moving(_with_others(shots, sweeps))
+
+
+def _with_others(
+    shots: dict[tuple[int, str], _Shot], sweeps: list[_Sweep | None]
+) -> dict[tuple[int, str], _Shot]:
+    """The same shots with the sweeps of the samples before and after."""
+    return {
+        key: replace(
+            shot,
+            others=tuple(
+                other
+                for other in (
+                    *sweeps[max(key[0] - 1, 0) : key[0]],
+                    *sweeps[key[0] + 1 : key[0] + 2],
+                )
+                if other is not None
+            ),
+        )
+        for key, shot in shots.items()
+    }
 
 
 def _datum(key: Record, data: dict[str, Record]) -> Record:
@@ -197,7 +229,7 @@ def _camera_name(name: Record) -> str:
     return text
 
 
-def _sweep(members: list[Record], folder: Path) -> _Sweep | None:
+def _sweep(members: list[Record], folder: Path, start: float) -> _Sweep | None:
     """The sample's LiDAR sweep, None where it has none."""
     for member in members:
         cloud = member["datum"].get("point_cloud")
@@ -205,6 +237,7 @@ def _sweep(members: list[Record], folder: Path) -> _Sweep | None:
             continue
         boxes = cloud["annotations"].get(_BOXES_3D)
         return _Sweep(
+            (_microseconds(member["id"]["timestamp"]) - start) / 1e6,
             inside(folder, cloud["filename"].text(), cloud["filename"].where),
             _pose(cloud["pose"]),
             None if boxes is None else inside(folder, boxes.text(), boxes.where),
@@ -286,23 +319,58 @@ def _points_world(sweep: _Sweep) -> Float64:
     return np.asarray(points @ sweep.world_from_lidar[:3, :3].T + sweep.world_from_lidar[:3, 3])
 
 
-def _boxes(sweep: _Sweep, class_names: dict[int, str]) -> tuple[Box, ...]:
-    if sweep.boxes_path is None:
-        return ()
+def _boxes(
+    sweep: _Sweep, others: tuple[_Sweep, ...], class_names: dict[int, str]
+) -> tuple[Box, ...]:
+    """Boxes of a sweep; their velocities are from where their tracks are in the sweeps around."""
+    annotations = _annotations(sweep)
+    places = [(other.time_s, _places(other)) for other in others if annotations]
     boxes = []
-    for annotation in read_json(sweep.boxes_path)["annotations"]:
+    for annotation in annotations:
         box = annotation["box"]
+        track = annotation["instance_id"].integer()
         class_id = annotation["class_id"].integer()
         size = tuple(box[side].number() for side in ("length", "width", "height"))
-        boxes.append(
-            Box(
-                annotation["instance_id"].integer(),
+        world_from_box = sweep.world_from_lidar @ _pose(box["pose"])
+        seen = [(time_s, place[track]) for time_s, place in places if track in place]
+        try:
+            found = Box(
+                track,
                 class_names.get(class_id, str(class_id)),
-                sweep.world_from_lidar @ _pose(box["pose"]),
+                world_from_box,
                 (size[0], size[1], size[2]),
+                _velocity([*seen, (sweep.time_s, world_from_box[:3, 3])]),
             )
-        )
+        except CalibrationError as error:
+            raise CalibrationError(f"{annotation.where}: {error}") from None
+        boxes.append(found)
     return tuple(boxes)
+
+
+def _annotations(sweep: _Sweep) -> list[Record]:
+    return [] if sweep.boxes_path is None else list(read_json(sweep.boxes_path)["annotations"])
+
+
+def _places(sweep: _Sweep) -> dict[int, Float64]:
+    """(3,) world place of each track's box, metres."""
+    return {
+        annotation["instance_id"].integer(): np.asarray(
+            (sweep.world_from_lidar @ _pose(annotation["box"]["pose"]))[:3, 3]
+        )
+        for annotation in _annotations(sweep)
+    }
+
+
+def _velocity(seen: list[tuple[float, Float64]]) -> Float64 | None:
+    """(3,) m/s from the first to the last moment; None of one moment, or where the track jumps."""
+    (first_s, first), (last_s, last) = (
+        ends(seen, key=lambda moment: moment[0]) for ends in (min, max)
+    )
+    if last_s <= first_s:
+        return None
+    velocity: Float64 = (last - first) / (last_s - first_s)
+    # An id that was given anew to something else.
+    return velocity if np.linalg.norm(velocity) <= MAX_SPEED_M_PER_S else None
 
 
 def _class_names(scene: Record, folder: Path) -> dict[int, str]:

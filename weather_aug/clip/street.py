@@ -239,8 +239,8 @@ def _box(actor: Actor) -> Box:
     pose[:2, :2] = [[c, -s], [s, c]]
     x, y, z = actor.position_world
     pose[:3, 3] = x, y, z + actor.size_m[2] / 2
-    pose.flags.writeable = False
-    return Box(actor.track_id, actor.class_name, pose, actor.size_m)
+    velocity = np.array(actor.velocity_m_per_s)
+    return Box(actor.track_id, actor.class_name, pose, actor.size_m, velocity)
 
 
 def _in_picture(actor: Actor, camera: Camera) -> bool:

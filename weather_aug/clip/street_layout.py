@@ -37,6 +37,8 @@ class Actor(NamedTuple):
     """On the ground, under the middle."""
     yaw_rad: float
     size_m: Size
+    velocity_m_per_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """World axes."""
 
 
 class Chunk(NamedTuple):

@@ -13,7 +13,7 @@ from weather_aug.clip.street_layout import SECTION, Actor, place_at
 from weather_aug.clip.street_models import Draws
 from weather_aug.clip.street_movers import Size, bicycle, bus, car, person, truck
 from weather_aug.clip.street_parts import Parts, placed
-from weather_aug.clip.street_path import EGO_SPEED_M_PER_S, Curve
+from weather_aug.clip.street_path import EGO_SPEED_M_PER_S, Curve, centre_slope
 
 
 class Column(NamedTuple):
@@ -75,7 +75,10 @@ def _members(
         # Slots stay below 2**20 either way for a day's drive.
         track = (number << 22) + (1 << 21) + slot + (1 << 30)
         world = placed(parts, position, yaw)
-        actors.append(Actor(track, class_name, world, position, yaw, size))
+        # The columns are constant in dx/dt and keep their offset from the centre line.
+        along = column.speed_m_per_s
+        velocity = (along, centre_slope(curve, station) * along, 0.0)
+        actors.append(Actor(track, class_name, world, position, yaw, size, velocity))
     return actors
 
 

@@ -119,14 +119,40 @@ _CAMERA_SHAPES = {
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """A tracked 3D box at one moment."""
+    """A tracked 3D box at one moment.
+
+    Raises:
+        CalibrationError: If the pose is not a finite rigid motion (to 1e-4), a side is not positive
+            and finite, or the velocity is not finite or beyond 150 m/s.
+    """
 
     track_id: int
     class_name: str
     world_from_box: Float64
     """(4, 4), metres; the box is centred on its own origin."""
     size_m: tuple[float, float, float]
-    """Extent along the box's own x, y and z."""
+    """Extent along the box's own x (ahead), y (to the left) and z (up)."""
+    velocity_m_per_s: Float64 | None = None
+    """(3,), of the box's centre, in world axes; None where unknown."""
+
+    def __post_init__(self) -> None:
+        pose = _frozen_array("world_from_box", self.world_from_box, (4, 4))
+        _check_rigid("world_from_box", pose)
+        object.__setattr__(self, "world_from_box", pose)
+        size = _frozen_array("size_m", self.size_m, (3,))
+        if not (size > 0).all():
+            raise CalibrationError(f"size_m must be positive, got {size.tolist()}")
+        object.__setattr__(self, "size_m", tuple(size.tolist()))
+        if self.velocity_m_per_s is None:
+            return
+        velocity = _frozen_array("velocity_m_per_s", self.velocity_m_per_s, (3,))
+        speed = float(np.linalg.norm(velocity))
+        if speed > MAX_SPEED_M_PER_S:
+            raise CalibrationError(
+                f"box {self.track_id} moves at {speed:.3g} m/s, as nothing on a street does; look "
+                "for a jump in its track"
+            )
+        object.__setattr__(self, "velocity_m_per_s", velocity)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@
     frames/000012_front.png             the recorded picture, lossless
     frames/000012_front.depth.npy       (H, W) float16 z-depth, metres, inf for the sky
     frames/000012_front.label.npy       (H, W) uint8 train ids, where the clip is labelled
+    frames/000012_front.boxes.json      tracked boxes, where there are any
     shelter.npy                         (A, L) float32 undersides over the street, if there are any
 
 Data only: nothing in it can run code, every file has its size and SHA-256 in the manifest, and the
@@ -31,6 +32,7 @@ from weather_aug.clip.types import RIGID_TOLERANCE, Camera, Frame, FrameKey
 from weather_aug.edit.ambience import CAMERA_HEIGHT_M, CAMERA_HEIGHT_RANGE_M, Ambience
 from weather_aug.errors import ArgumentError, DataError, IntegrityError, SceneError, printable
 from weather_aug.particles.shelter import CELL_M, Shelter
+from weather_aug.scene.boxes import encode_boxes, read_boxes
 from weather_aug.taxonomy import CLASSES, IGNORE
 
 FORMAT = "weather_aug scene"
@@ -47,6 +49,8 @@ LARGEST = 1e10
 """No coordinate (metres, pixels), speed or time (seconds) of a drive is greater."""
 
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+_SUFFIXES = {"image": "png", "depth": "depth.npy", "label": "label.npy", "boxes": "boxes.json"}
+"""Of the file of each part of a frame."""
 _DEPTH, _LABEL, _COVER = "<f2", "|u1", "<f4"
 _PNG_START = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
 _MALFORMED = (
@@ -73,7 +77,7 @@ class FrameRecord:
     light: Mapping[str, NDArray[np.float64]]
     """Linear RGB of `sky`, `middle` and `ground` (medians) and of the frame's own `airlight`."""
     files: Mapping[str, str]
-    """Relative path by part: `image`, `depth`, and `label` where there is one."""
+    """Relative path by part: `image`, `depth`, and `label` and `boxes` where there are any."""
     camera_height_m: float = CAMERA_HEIGHT_M
     """Over the road, as this frame shows it."""
 
@@ -138,19 +142,21 @@ def encode_frame(frame: Frame) -> dict[str, bytes]:
     parts = {"image": png_bytes(frame.image), "depth": _npy(stored, _DEPTH)}
     if frame.label is not None:
         parts["label"] = _npy(frame.label, _LABEL)
+    if frame.boxes:
+        parts["boxes"] = encode_boxes(frame.key, frame.boxes)
     return parts
 
 
 def part_path(key: FrameKey, part: str) -> str:
     """Relative path of one part of a frame."""
-    suffix = {"image": "png", "depth": "depth.npy", "label": "label.npy"}[part]
-    return f"{FRAMES}/{key}.{suffix}"
+    return f"{FRAMES}/{key}.{_SUFFIXES[part]}"
 
 
 def frame_record(frame: Frame, ambience: Ambience) -> dict[str, Any]:
     """The manifest's entry for a frame, as JSON values."""
     camera = frame.camera
-    parts = ("image", "depth") if frame.label is None else ("image", "depth", "label")
+    present = {"image": True, "depth": True, "label": frame.label is not None}
+    present["boxes"] = bool(frame.boxes)
     return {
         "time_index": frame.key.time_index,
         "camera": frame.key.camera,
@@ -165,7 +171,7 @@ def frame_record(frame: Frame, ambience: Ambience) -> dict[str, Any]:
         "angular_velocity_rad_per_s": camera.angular_velocity_rad_per_s.tolist(),
         "light": {name: getattr(ambience, name).tolist() for name in LIGHTS},
         "camera_height_m": ambience.camera_height_m,
-        "files": {part: part_path(frame.key, part) for part in parts},
+        "files": {part: part_path(frame.key, part) for part in _SUFFIXES if present[part]},
     }
 
 
@@ -252,14 +258,15 @@ def damaged_files(folder: Path, manifest: Manifest) -> list[str]:
 
 
 def read_frame(folder: Path, record: FrameRecord) -> Frame:
-    """One frame; depth and label are memory-mapped, the picture is decoded.
+    """One frame; depth and label are memory-mapped, picture and boxes are decoded.
 
     Raises:
         SceneError: If a file of it cannot be read.
     """
     image = _picture(folder / record.files["image"], record.camera)
     depth, label = read_surfaces(folder, record)
-    return Frame(record.key, record.time_s, record.camera, image, label, depth)
+    boxes = read_boxes(folder / record.files["boxes"]) if "boxes" in record.files else ()
+    return Frame(record.key, record.time_s, record.camera, image, label, depth, boxes=boxes)
 
 
 def read_surfaces(
@@ -414,8 +421,10 @@ def parse_frame(entry: Any) -> FrameRecord:
         angular_velocity_rad_per_s=entry["angular_velocity_rad_per_s"],
     )
     files = {part: str(entry["files"][part]) for part in ("image", "depth")}
-    if "label" in entry["files"]:
-        files["label"] = str(entry["files"]["label"])
+    # Scenes of before boxes were stored have none.
+    files |= {
+        part: str(entry["files"][part]) for part in ("label", "boxes") if part in entry["files"]
+    }
     light = {name: _light(entry["light"][name]) for name in LIGHTS}
     key = FrameKey(int(entry["time_index"]), check_name("camera", entry["camera"]))
     time_s = float(entry["time_s"])

@@ -8,7 +8,7 @@ from render_scene import make_camera, make_frame
 
 from weather_aug.clip.types import Frame
 from weather_aug.edit.ambience import Ambience
-from weather_aug.render.batch import render_batch
+from weather_aug.render.batch import BATCH_OPTIONS, render_batch
 from weather_aug.render.compose import render
 from weather_aug.taxonomy import BUILDING, ROAD, SKY
 from weather_aug.weather import Weather
@@ -58,7 +58,8 @@ class Case:
     seed: int = 3
 
     def alone(self, **choices):
-        """By `render`."""
+        """By `render`, with what a batch draws."""
+        choices = {"options": BATCH_OPTIONS} | choices
         return render(self.frame, self.weather, seed=self.seed, ambience=AMBIENCE, **choices)
 
 

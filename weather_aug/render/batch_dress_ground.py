@@ -1,0 +1,211 @@
+"""Water and snow on ground pixels in torch; the formulas of `edit.physical.ground_rows`.
+
+Pixels of all ground classes go through them together: where a class takes no snow, no water or no
+mirror, the amounts are 0 and change nothing. Differentiable with respect to the light.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from weather_aug.colour import LUMINANCE
+from weather_aug.edit.physical.dress import LIGHT, SHARP
+from weather_aug.edit.physical.fresnel import (
+    DIFFUSE_FROM_AIR,
+    DIFFUSE_FROM_WATER,
+    WATER_INDEX,
+)
+from weather_aug.edit.physical.ground_rows import (
+    ASPHALT_ALBEDO,
+    GUESSED_HEIGHTS,
+    LANE_M,
+    LATERAL,
+    MICRO_SLOPE,
+    SNOW_ALBEDO,
+    TRACK_M,
+    WHEEL_M,
+)
+from weather_aug.edit.physical.materials import COVER, MIRROR, POROSITY, ROAD
+from weather_aug.render.batch_dress_grid import Grid, Pixels
+from weather_aug.render.batch_dress_noise import ground_noise
+
+POOL_OFFSET_M = 11.3
+"""Where in the noise water stands, from where snow lies."""
+FARTHEST_M = 1e4
+FLATTEST_SINE, FLATTEST_SIZE_SINE = 0.004, 0.02
+OTHER_LANES_LESS = 0.45
+SPARED_BY_WHEELS = 0.85
+
+
+class _Places(NamedTuple):
+    """Of ground pixels, (N,) each."""
+
+    along_m: Tensor
+    left_m: Tensor
+    sine: Tensor
+    """Of the angle between view and road."""
+    size_m: Tensor
+    """Of the pixel on the road, along it."""
+
+
+def dressed_ground(
+    light: Tensor, pixels: Pixels, grid: Grid, geometry: SimpleNamespace, look: SimpleNamespace
+) -> Tensor:
+    """Wet and snowed on ground.
+
+    Args:
+        light: (3, N) linear light under the weather's sky.
+        pixels: Of ground classes.
+        grid: The editor's maps under the weather's light.
+        geometry: `edit.physical.dress.Geometry` of the whole picture, plain.
+        look: `edit.physical.look.Look` of the weather, plain.
+
+    Returns:
+        (3, N).
+    """
+    material = pixels.material
+    road = material[:, ROAD] > 0
+    amount = torch.where(road, look.road_snow, look.snow * material[:, COVER])
+    (lit,) = grid.at(LIGHT, 1, pixels)
+    places = _places(pixels, geometry)
+    noise, tracks = torch.zeros_like(lit), torch.zeros_like(lit)
+    snowy = max(look.road_snow, look.snow) > 0
+    if snowy or look.puddles > 0:
+        noise = ground_noise(places.along_m, places.left_m, places.size_m, 0.0)
+        (lateral_m,) = grid.at(LATERAL, 1, pixels)
+        tracks = torch.where(road, look.tracks * tracks_at(lateral_m, noise), 0.0)
+    if look.film > 0:
+        light = film(light, lit, look.film * material[:, POROSITY])
+    if look.mirror > 0:
+        pool = torch.zeros_like(lit)
+        if look.puddles > 0:
+            lie = ground_noise(places.along_m, places.left_m, places.size_m, POOL_OFFSET_M)
+            pool = covered(look.puddles * (1.0 + 1.5 * tracks), _fuzz(places.size_m), lie)
+            pool = torch.where(road, pool, 0.0)
+        shine = look.mirror * material[:, MIRROR] * _level(pixels, geometry)
+        shown = grid.at(SHARP, 6, pixels)
+        light = _mirrored(light, shown, pool, shine, places.sine, look.flooded)
+    if snowy:
+        spared = amount * (1.0 - SPARED_BY_WHEELS * tracks)
+        cover = covered(spared, _fuzz(places.size_m), noise)
+        light = _snowed(light, lit, cover, noise, look)
+    return light
+
+
+def ramp(low: float | Tensor, high: float | Tensor, value: Tensor) -> Tensor:
+    """Smooth step from 0 at `low` to 1 at `high`."""
+    t = ((value - low) / (high - low)).clamp(0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+def covered(amount: Tensor, fuzz: float | Tensor, noise: Tensor) -> Tensor:
+    """How far a place of this noise is covered when a share `amount` of all places is."""
+    threshold = 1.0 + fuzz - amount * (1.0 + 2.0 * fuzz)
+    return ramp(threshold - fuzz, threshold + fuzz, noise)
+
+
+def _fuzz(size_m: Tensor) -> Tensor:
+    """How soft the border of a patch is at a pixel of this size."""
+    return (0.07 + 0.25 * size_m).clamp(max=0.5)
+
+
+def _places(pixels: Pixels, geometry: SimpleNamespace) -> _Places:
+    z = pixels.depth_m.clamp(max=FARTHEST_M)
+    along = pixels.towards(geometry.along_x, geometry.along_y, geometry.along_z)
+    left = pixels.towards(geometry.left_x, geometry.left_y, geometry.left_z)
+    climb = pixels.towards(geometry.climb_x, geometry.climb_y, geometry.climb_z)
+    across = 1.0 + pixels.ray_y * pixels.ray_y
+    sine = (-climb / torch.sqrt(across + pixels.ray_x * pixels.ray_x)).clamp(min=FLATTEST_SINE)
+    return _Places(
+        geometry.along_0 + z * along,
+        geometry.left_0 + z * left,
+        sine,
+        z / geometry.fy / sine.clamp(min=FLATTEST_SIZE_SINE),
+    )
+
+
+def tracks_at(lateral_m: Tensor, noise: Tensor) -> Tensor:
+    """How far in a wheel's track, in [0, 1]; other lanes are driven less.
+
+    Args:
+        lateral_m: (N,) how far left of the driven way, metres.
+        noise: (N,) by which tracks wander.
+    """
+    side = lateral_m + 0.5 * (noise - 0.5)
+    lane = torch.floor(side * (1.0 / LANE_M) + 0.5)
+    off = ((side - LANE_M * lane).abs() - WHEEL_M).abs()
+    track = 1.0 - ramp(0.5 * TRACK_M, 1.5 * TRACK_M, off)
+    return track * (1.0 - OTHER_LANES_LESS * lane.abs()).clamp(min=0.0)
+
+
+def film(light: Tensor, lit: Tensor, wet: Tensor) -> Tensor:
+    """Light (3, N) under a film of water, `wet` (N,) of it; `lit` (N,) is the light on it."""
+    albedo = (light / lit.clamp(min=0.02)).clamp(0.01, 0.95)
+    passes = (1.0 - DIFFUSE_FROM_AIR) * (1.0 - DIFFUSE_FROM_WATER)
+    ratio = passes / (1.0 - DIFFUSE_FROM_WATER * albedo)
+    return light * (1.0 + wet * (ratio - 1.0))
+
+
+def _level(pixels: Pixels, geometry: SimpleNamespace) -> Tensor | float:
+    """Share of the mirror that a pixel's height over the road leaves: guesses may be wrong."""
+    if geometry.labelled:
+        return 1.0
+    climb = pixels.towards(geometry.climb_x, geometry.climb_y, geometry.climb_z)
+    # Endless depth times a level view would be no number.
+    height_m = geometry.height_0 + pixels.depth_m.clamp(max=FARTHEST_M) * climb
+    return 1.0 - ramp(*GUESSED_HEIGHTS, height_m)
+
+
+def _mirrored(
+    light: Tensor, shown: Tensor, pool: Tensor, shine: Tensor, sine: Tensor, flooded_share: float
+) -> Tensor:
+    """What the film and the puddles mirror; `shown` (6, N) is the light in calm and rough water."""
+    flooded = flooded_share + pool * (1.0 - flooded_share)
+    rough = fresnel_of_sine(torch.sqrt(sine * sine + MICRO_SLOPE * MICRO_SLOPE))
+    stones = shine * (1.0 - flooded) * 0.5 * rough
+    calm = shine * flooded * fresnel_of_sine(sine)
+    kept = (1.0 - stones - calm) * (1.0 - 0.2 * pool)
+    sharp, smeared = shown[:3], shown[3:]
+    return kept * light + stones * smeared + calm * (smeared + pool * (sharp - smeared))
+
+
+def fresnel_of_sine(sine: Tensor) -> Tensor:
+    """Share of unpolarised light that water mirrors, by the sine of the grazing angle."""
+    index2 = WATER_INDEX**2
+    inside = torch.sqrt(sine * sine + (index2 - 1.0))
+    across = (inside - sine) / (inside + sine)
+    along = (index2 * sine - inside) / (index2 * sine + inside)
+    return 0.5 * (across * across + along * along)
+
+
+def _snowed(
+    light: Tensor, lit: Tensor, cover: Tensor, noise: Tensor, look: SimpleNamespace
+) -> Tensor:
+    """Snow over what lies there; a little of it shows through."""
+    under = (luminance(light) / (ASPHALT_ALBEDO * lit)).clamp(max=2.0)
+    shade = (0.90 + 0.12 * noise) * (0.95 + 0.05 * under)
+    return laid(light, cover, snow_light(lit, look) * shade, look)
+
+
+def luminance(light: Tensor) -> Tensor:
+    """(N,) of linear light (3, N)."""
+    red, green, blue = (float(weight) for weight in LUMINANCE)
+    return red * light[0] + green * light[1] + blue * light[2]
+
+
+def snow_light(lit: Tensor, look: SimpleNamespace) -> Tensor:
+    """Luminance of snow under this light, as the camera exposes it."""
+    bright = SNOW_ALBEDO * lit * look.exposure
+    return bright.clamp(0.62 * look.snow_light, look.snow_light)
+
+
+def laid(light: Tensor, cover: Tensor, luminance_of_snow: Tensor, look: SimpleNamespace) -> Tensor:
+    """Light (3, N) with snow of this luminance (N,), in the airlight's colour, blended over it."""
+    airlight = light.new_tensor((look.red, look.green, look.blue))
+    white = luminance_of_snow / luminance(airlight)
+    tint = airlight * light.new_tensor((1.0, 1.0, 1.02))
+    return light + cover * (tint[:, None] * white - light)

@@ -1,0 +1,82 @@
+"""World-anchored noise in torch; the look-ups of `weather_aug.edit.physical.noise`."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from weather_aug.edit.physical.noise import (
+    _TURN,
+    CELL_M,
+    COARSE_SHARE,
+    COARSER,
+    LEVELS,
+    TILE_CELLS,
+    noise_tile,
+)
+
+COARSER_LEVELS = 4
+"""By so many copies the tile is finer at the coarse look, which is 16 times as large."""
+
+
+@torch.no_grad()
+def ground_noise(along_m: Tensor, left_m: Tensor, footprint_m: Tensor, offset_m: float) -> Tensor:
+    """Noise in [0, 1], evenly spread, of places on the ground; `offset_m` chooses another one.
+
+    Args:
+        along_m: (N,) metres along the street.
+        left_m: (N,) metres to its left.
+        footprint_m: (N,) size of the pixel on the ground: what is smaller is averaged.
+        offset_m: Metres.
+
+    Returns:
+        (N,), of the places' dtype and device.
+    """
+    tile = _tile_on(along_m.device)
+    per_m = 1.0 / CELL_M
+    limits = torch.arange(LEVELS - 1, device=along_m.device).to(along_m.dtype)
+    level = torch.bucketize(footprint_m * per_m, 1.5 * torch.exp2(limits))
+    fine = _looked_up(tile, (along_m + offset_m) * per_m, (left_m - offset_m) * per_m, level)
+    cosine, sine = _TURN
+    u, v = cosine * along_m + sine * left_m, cosine * left_m - sine * along_m
+    slow = per_m / COARSER
+    coarse_level = (level - COARSER_LEVELS).clamp(min=0)
+    coarse = _looked_up(tile, (u - offset_m) * slow, (v + offset_m) * slow, coarse_level)
+    return evened(COARSE_SHARE * coarse + (1.0 - COARSE_SHARE) * fine)
+
+
+@cache
+def _tile_on(device: torch.device) -> Tensor:
+    """The tile and its smaller copies, uploaded once; torch owns what it may write to."""
+    return torch.tensor(noise_tile(), device=device)
+
+
+def _looked_up(tile: Tensor, u: Tensor, v: Tensor, level: Tensor) -> Tensor:
+    """Bilinear values in [0, 1] at (u, v), in cells of level 0, on copies of the tile."""
+    size = torch.bitwise_right_shift(torch.full_like(level, TILE_CELLS), level)
+    # Level k starts after 4/3 (512^2 - size^2) cells.
+    start = (4 * TILE_CELLS**2 - 4 * size * size) // 3
+    scale = torch.exp2(-level.to(u.dtype))
+    x, y = u * scale - 0.5, v * scale - 0.5
+    left, top = x.floor(), y.floor()
+    mask = size - 1
+    column, row = left.long(), top.long()
+    above, below = start + (row & mask) * size, start + ((row + 1) & mask) * size
+    near, far = column & mask, (column + 1) & mask
+    a, b, c, d = (
+        tile[index].to(u.dtype) for index in (above + near, above + far, below + near, below + far)
+    )
+    upper = torch.lerp(a, b, x - left)
+    lower = torch.lerp(c, d, x - left)
+    return torch.lerp(upper, lower, y - top) / 255.0
+
+
+def evened(value: Tensor) -> Tensor:
+    """Distribution function of the sum of both looks: what makes it evenly spread again."""
+    a, b = COARSE_SHARE, 1.0 - COARSE_SHARE
+    low = value * value / (2.0 * a * b)
+    high = 1.0 - (1.0 - value).square() / (2.0 * a * b)
+    middle = (value - 0.5 * b) / a
+    return torch.where(value < b, low, torch.where(value > a, high, middle))

@@ -1,0 +1,126 @@
+"""Water and snow on what stands, in torch; the formulas of `edit.physical.standing_rows`.
+
+Differentiable with respect to the light.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import torch
+from torch import Tensor
+
+from weather_aug.edit.physical.dress import LIGHT, NO_CAP_M
+from weather_aug.edit.physical.materials import CAP_M, COVER, LEAF, LEVEL, POROSITY
+from weather_aug.edit.physical.standing_rows import BURIED_RANGE_M, OBLIQUE
+from weather_aug.render.batch_dress_grid import Grid, Pixels
+from weather_aug.render.batch_dress_ground import covered, film, laid, luminance, ramp, snow_light
+from weather_aug.render.batch_dress_noise import ground_noise
+
+FARTHEST_M = 1e4
+
+
+@torch.no_grad()
+def below_top_m(classes: Tensor, depth_m: Tensor, fy: float) -> Tensor:
+    """How far each pixel (H, W) lies below the upper edge of its own thing, metres.
+
+    A thing is a run down a column of one class without a jump of depth; it has an upper edge where
+    what is above it lies behind it. Without one it is endlessly far below, as `NO_CAP_M`.
+
+    Args:
+        classes: (H, W) uint8 train ids.
+        depth_m: (H, W), `inf` for what is far.
+        fy: Focal length, pixels.
+    """
+    depth = depth_m.double()
+    above = torch.nn.functional.pad(depth, (0, 0, 1, 0))[:-1]
+    class_above = torch.nn.functional.pad(classes, (0, 0, 1, 0), value=255)[:-1]
+    same = (classes == class_above) & ((depth - above).abs() < 1.5 + 0.2 * depth)
+    fresh = torch.where(above > 1.05 * depth + 0.3, 0.0, NO_CAP_M).to(depth.dtype)
+    # The sum of steps down to here, less that down to where the run began.
+    sunk = torch.where(same, depth / fy, 0.0).cumsum(0)
+    row = torch.arange(len(depth), device=depth.device)[:, None]
+    began = torch.where(same, 0, row).cummax(0).values
+    return (sunk + (fresh - sunk).gather(0, began)).to(depth_m.dtype)
+
+
+def holds_snow(material: Tensor) -> Tensor:
+    """(N,) bool, whether snow lies on some part of such a thing."""
+    return ((material[:, CAP_M] > 0) | (material[:, LEAF] > 0)) & (material[:, COVER] > 0)
+
+
+def wet_standing(light: Tensor, pixels: Pixels, grid: Grid, look: SimpleNamespace) -> Tensor:
+    """Light (3, N) of wet walls, trunks and clothes."""
+    (lit,) = grid.at(LIGHT, 1, pixels)
+    return film(light, lit, look.film * pixels.material[:, POROSITY])
+
+
+def snowed_standing(
+    light: Tensor,
+    pixels: Pixels,
+    below_m: Tensor,
+    grid: Grid,
+    geometry: SimpleNamespace,
+    look: SimpleNamespace,
+) -> Tensor:
+    """Snow on upper edges, level parts and leaves and around the foot.
+
+    Args:
+        light: (3, N) linear light.
+        pixels: That hold snow, at finite depths.
+        below_m: (N,) of `below_top_m`.
+        grid: The editor's maps under the weather's light.
+        geometry: `edit.physical.dress.Geometry` of the whole picture, plain.
+        look: `edit.physical.look.Look` of the weather, plain.
+
+    Returns:
+        (3, N).
+    """
+    z, material = pixels.depth_m, pixels.material
+    lit, mean, facing_up = grid.at(LIGHT, 3, pixels)
+    climb = pixels.towards(geometry.climb_x, geometry.climb_y, geometry.climb_z)
+    along = pixels.towards(geometry.along_x, geometry.along_y, geometry.along_z)
+    left = pixels.towards(geometry.left_x, geometry.left_y, geometry.left_z)
+    height_m = geometry.height_0 + z * climb
+    slope_m, size_m = OBLIQUE * height_m, z / geometry.fy
+    noise = ground_noise(
+        geometry.along_0 + z * along + slope_m, geometry.left_0 + z * left + slope_m, size_m, 0.0
+    )
+    lit = lit.clamp(min=0.02)
+    mean = mean.clamp(min=0.002)
+    amount = look.snow * material[:, COVER]
+    leaf = material[:, LEAF] > 0
+    here = luminance(light) / (mean * look.exposure)
+    cover = torch.where(
+        leaf,
+        _on_leaves(here, amount, noise),
+        _on_edges(below_m, facing_up, amount, size_m, noise, material, look),
+    )
+    buried = height_m < look.snow_depth_m * (0.6 + 0.8 * noise)
+    cover = torch.where(buried & (z < BURIED_RANGE_M), cover.clamp(min=look.snow), cover)
+    bright = snow_light(lit, look) * (0.81 + 0.11 * noise)
+    shaded = torch.where(leaf, (0.25 + 4.0 * mean / lit).clamp(max=0.85), 1.0)
+    return laid(light, cover, bright * shaded, look)
+
+
+def _on_leaves(brightness: Tensor, amount: Tensor, noise: Tensor) -> Tensor:
+    """Cover of a crown, the bright parts first; `brightness` is over the mean around it."""
+    detail = (0.5 + 0.7 * (brightness - 1.0)).clamp(0.0, 1.0)
+    return covered(0.8 * amount, 0.2, 0.25 * noise + 0.75 * detail)
+
+
+def _on_edges(
+    below_m: Tensor,
+    facing_up: Tensor,
+    amount: Tensor,
+    size_m: Tensor,
+    noise: Tensor,
+    material: Tensor,
+    look: SimpleNamespace,
+) -> Tensor:
+    """Cover of a cap on the upper edge and of level parts."""
+    edge_m = material[:, CAP_M] * look.snow * (0.6 + 0.8 * noise) + 0.4 * look.snow_depth_m
+    cap = 1.0 - ramp(0.7 * edge_m, 1.2 * edge_m, below_m)
+    level = ramp(0.55, 0.85, facing_up)
+    lies = covered(amount * level, 0.07 + 0.25 * size_m, noise)
+    return torch.where(material[:, LEVEL] > 0, torch.maximum(cap, lies), cap)

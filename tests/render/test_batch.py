@@ -1,7 +1,7 @@
 """render_batch(): the same pictures as render(), in torch, with gradients."""
 
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 
 import numpy as np
@@ -24,10 +24,11 @@ from weather_aug.errors import ArgumentError, MissingExtraError
 from weather_aug.particles.shelter import Shelter
 from weather_aug.render import batch as batch_module
 from weather_aug.render import batch_medium, batch_particles, batch_project, batch_shade
-from weather_aug.render.batch import render_batch
-from weather_aug.render.batch_checks import NOT_DRAWN
+from weather_aug.render.background import looked_at
+from weather_aug.render.batch import BATCH_OPTIONS, render_batch
+from weather_aug.render.batch_checks import NOT_DRAWN, UNDRAWN
 from weather_aug.render.fields import RigMotion
-from weather_aug.render.options import RenderOptions
+from weather_aug.render.options import EFFECTS, RenderOptions
 from weather_aug.weather import Weather
 
 WAYS = ("torch", "compiled")
@@ -70,9 +71,9 @@ def without_compensation(monkeypatch):
 
 
 def in_gamma_space(monkeypatch):
-    right = batch_shade.toned_light
+    right = batch_module._background
     encode = batch_shade.encoded
-    monkeypatch.setattr(batch_shade, "toned_light", lambda *a: encode(right(*a)))
+    monkeypatch.setattr(batch_module, "_background", lambda *a: encode(right(*a)))
     monkeypatch.setattr(batch_shade, "encoded", lambda light: light.clamp(0, 1))
 
 
@@ -237,9 +238,9 @@ def test_options_of_the_particles_are_passed_on():
     rig = RigMotion(first, here)
     plain = case.alone()
     for choices in (
-        {"options": RenderOptions(alignment="camera"), "rig": rig},
-        {"options": RenderOptions(rain_fall_speed="atlas")},
-        {"options": RenderOptions(max_particles=300)},
+        {"options": replace(BATCH_OPTIONS, alignment="camera"), "rig": rig},
+        {"options": replace(BATCH_OPTIONS, rain_fall_speed="atlas")},
+        {"options": replace(BATCH_OPTIONS, max_particles=300)},
     ):
         expected = case.alone(**choices)
         rigs = [choices["rig"]] if "rig" in choices else None
@@ -264,6 +265,7 @@ def test_refusals():
         "airs": ([0, None], [Air((0, 0, 0), (0, 0, 0))]),
         "shelters": (["roof", None], [None]),
         "rigs": ([np.eye(4), None], [None], 3),
+        "layers": ([None], ["seen", None], [looked_at(street(), AMBIENCE), None]),
         "options": (None,),
         "splatting": ("cuda", "gsplat"),
     }
@@ -279,15 +281,44 @@ def test_refusals():
 
 def test_what_is_not_drawn_is_refused():
     inputs = arguments([Case(street(width=20, height=12), WEATHERS["fog"])])
-    for name, value in (("multiple_scattering", True), ("preset", "weatheredit")):
+    for name, value in (
+        ("multiple_scattering", True),
+        ("preset", "weatheredit"),
+        ("labels", "keep"),
+    ):
         with pytest.raises(ArgumentError, match=rf"options\.{name}"):
             render_batch(**(inputs | {"options": RenderOptions(**{name: value})}))
 
 
+@pytest.mark.parametrize("effect", UNDRAWN)
+def test_an_effect_that_is_not_drawn_must_be_left_out_by_name(effect):
+    inputs = arguments([Case(street(width=20, height=12), WEATHERS["fog"])])
+    others = tuple(name for name in UNDRAWN if name != effect)
+    with pytest.raises(ArgumentError, match=rf"options\.without .*add {effect}, start"):
+        render_batch(**inputs, options=RenderOptions(without=others))
+
+
 def test_every_option_is_drawn_or_refused():
     """A new option of `render` has to be thought of here; `ablation` needs a preset."""
-    drawn = {"max_particles", "alignment", "rain_fall_speed"}
+    drawn = {"max_particles", "alignment", "rain_fall_speed", "without"}
     assert {f.name for f in fields(RenderOptions)} == drawn | {*NOT_DRAWN, "ablation"}
+
+
+def test_every_effect_is_drawn_or_left_out():
+    """A new effect of `render` has to be thought of here."""
+    drawn = {"relight", "sky", "film", "mirror", "puddles", "snow_cover", "tracks", "exposure"}
+    assert drawn.isdisjoint(UNDRAWN)
+    assert drawn | set(UNDRAWN) == set(EFFECTS)
+    assert BATCH_OPTIONS == RenderOptions(without=UNDRAWN)
+
+
+def test_the_shutter_is_open_longer_in_the_dark():
+    case = Case(street("driving", exposure_s=0.002), Weather.rain("extreme"))
+    short = replace(BATCH_OPTIONS, without=(*UNDRAWN, "exposure"))
+    own, kept = case.alone(), case.alone(options=short)
+    assert psnr(batch([case]).image[0], own.image) >= AGREEMENT_DB
+    assert psnr(batch([case], options=short).image[0], kept.image) >= AGREEMENT_DB
+    assert psnr(batch([case]).image[0], kept.image) < AGREEMENT_DB - 3
 
 
 def test_gsplat_is_named_when_it_is_missing(monkeypatch):

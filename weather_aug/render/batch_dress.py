@@ -161,11 +161,12 @@ class Dressing:
     def _pixels(self, depth_m: Tensor, rays: tuple[Tensor, Tensor], rows: slice) -> Pixels:
         count, width = depth_m.shape
         place = torch.arange(count * width, device=depth_m.device)
+        row, column = place[:count, None], place[None, :width]
         ray_x, ray_y = (ray.expand(count, width).reshape(-1) for ray in rays)
         return Pixels(
             place,
-            place // width,
-            place % width,
+            row.expand(count, width).reshape(-1),
+            column.expand(count, width).reshape(-1),
             depth_m.flatten(),
             ray_x,
             ray_y,

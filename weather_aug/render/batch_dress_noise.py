@@ -37,7 +37,7 @@ def ground_noise(along_m: Tensor, left_m: Tensor, footprint_m: Tensor, offset_m:
     tile = _tile_on(along_m.device)
     per_m = 1.0 / CELL_M
     limits = torch.arange(LEVELS - 1, device=along_m.device).to(along_m.dtype)
-    level = torch.bucketize(footprint_m * per_m, 1.5 * torch.exp2(limits))
+    level = torch.bucketize(footprint_m * per_m, 1.5 * torch.exp2(limits), out_int32=True)
     fine = _looked_up(tile, (along_m + offset_m) * per_m, (left_m - offset_m) * per_m, level)
     cosine, sine = _TURN
     u, v = cosine * along_m + sine * left_m, cosine * left_m - sine * along_m
@@ -62,11 +62,12 @@ def _looked_up(tile: Tensor, u: Tensor, v: Tensor, level: Tensor) -> Tensor:
     x, y = u * scale - 0.5, v * scale - 0.5
     left, top = x.floor(), y.floor()
     mask = size - 1
-    column, row = left.long(), top.long()
+    column, row = left.int(), top.int()
     above, below = start + (row & mask) * size, start + ((row + 1) & mask) * size
     near, far = column & mask, (column + 1) & mask
     a, b, c, d = (
-        tile[index].to(u.dtype) for index in (above + near, above + far, below + near, below + far)
+        tile.index_select(0, index).to(u.dtype)
+        for index in (above + near, above + far, below + near, below + far)
     )
     upper = torch.lerp(a, b, x - left)
     lower = torch.lerp(c, d, x - left)

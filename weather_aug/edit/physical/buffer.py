@@ -16,6 +16,8 @@ SIDE, POOL, COVERED = 15, 16, 17
 """Wheel tracks, standing water, snow or shine, all in [0, 1]."""
 MIRRORED = 18
 """Six rows: what calm water and what a film mirrors."""
+GROUNDED = 17
+"""1 where a pixel is ground."""
 FREE = 18
-"""Four rows for a moment."""
+"""Six rows for a moment."""
 ROWS = 24

@@ -10,18 +10,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from weather_aug._compiled import compiled, inlined
+from weather_aug._compiled import compiled
 from weather_aug._rows import encode_row, survival
-from weather_aug.edit.physical.buffer import BELOW_TOP, FREE, LUMA, ROWS, SKYNESS, B, G, R
+from weather_aug.edit.physical.buffer import BELOW_TOP, FREE, GROUNDED, LUMA, ROWS, SKYNESS, B, G, R
 from weather_aug.edit.physical.ground_rows import ground_run
 from weather_aug.edit.physical.layer_rows import load_row
-from weather_aug.edit.physical.layers import GROUND_GAIN, MATTE, OBJECT_GAIN
+from weather_aug.edit.physical.layers import GROUND_GAIN, MATTE
 from weather_aug.edit.physical.materials import CAP_M, COVER, GROUND, LEAF, POROSITY
 from weather_aug.edit.physical.noise_rows import KNOT_PX, knots_across, noise_row
 from weather_aug.edit.physical.relight import LEAST_GAIN, MOST_GAIN, SKY_FEATURE
 from weather_aug.edit.physical.spread import spread_run
 from weather_aug.edit.physical.standing_rows import NO_CAP_M, caps_row, film_run, standing_run
-from weather_aug.edit.surface import depth_row, light_row
+from weather_aug.edit.surface import depth_row
 
 CAP_ROWS = 96
 """How far above a window the upper edges of things are looked for, pixels."""
@@ -59,11 +59,14 @@ class Geometry(NamedTuple):
 
 
 @compiled
-def dress(surface, classes, window, geometry, look, tint, tone, table, layers, step, tile, out):
+def dress(
+    planes, surface, classes, window, geometry, look, tint, tone, table, layers, step, tile, out
+):
     """Paint one window's background in the weather.
 
     Args:
-        surface: The recorded picture.
+        planes: (3, H, W) uint8 sRGB of the window.
+        surface: The whole picture's depth and label.
         classes: (N,) uint8 train ids of the whole picture, guessed where nobody labelled.
         window: (top, left, height, width) in the whole picture.
         geometry: Camera of the whole picture.
@@ -84,11 +87,12 @@ def dress(surface, classes, window, geometry, look, tint, tone, table, layers, s
     pair = np.zeros((2, MAPS, columns), np.float32)
     at = np.array([-1, -1])
     scratch = np.empty((4, columns), np.float32)
-    small = np.zeros((MAPS, columns), np.float32)
-    cell = np.empty(width, np.int32)
+    # One more, so that the last cell has a next one.
+    small = np.zeros((MAPS, columns + 1), np.float32)
+    cell = np.empty(width, np.uint32)
     share = np.empty(width, np.float32)
     _cells(left, width, step, columns, cell, share)
-    first_cell, last_cell = cell[0], min(cell[width - 1] + 2, columns)
+    first_cell, last_cell = np.int64(cell[0]), min(np.int64(cell[width - 1]) + 2, columns)
     count, _ = knots_across(left, width, surface.width)
     knots = np.empty((2, count), np.float32)
     knot_depth = np.empty(count * KNOT_PX, np.float32)
@@ -123,8 +127,7 @@ def dress(surface, classes, window, geometry, look, tint, tone, table, layers, s
                 at[row % 2] = row
         down = place - np.float32(upper)
         _lerp_rows(pair, upper % 2, lower % 2, down, first_cell, last_cell, small)
-        light_row(surface, y, left, curve, b[R, :width], b[G, :width], b[B, :width])
-        luma_row(surface, y, left, b)
+        _light(planes, y - top, curve, width, b)
         if look.flattening > zero:
             _flatten(kinds, table, small, cell, share, look, tint, width, b)
         _tone(look.exposure, matrix, width, b)
@@ -141,7 +144,7 @@ def dress(surface, classes, window, geometry, look, tint, tone, table, layers, s
                 while x1 < width and kinds[x1] == kind:
                     x1 += 1
                 material = table[kind]
-                run = (x0, x1, left, y)
+                run = (np.uint64(x0), np.uint64(x1), np.float32(left), np.float32(y))
                 if material[GROUND] > zero:
                     ground_run(run, depth, geometry, look, material, small, cell, share, b)
                 else:
@@ -164,7 +167,7 @@ def _cells(left, width, step, columns, cell, share):
         place = (np.float32(left + x) + np.float32(0.5)) / step - np.float32(0.5)
         place = min(max(place, np.float32(0.0)), np.float32(columns - 1))
         first = min(np.int32(place), np.int32(max(columns - 2, 0)))
-        cell[x] = first
+        cell[x] = np.uint32(first)
         share[x] = place - np.float32(first)
 
 
@@ -185,64 +188,42 @@ def _any_sky(small, first, last):
 
 
 @compiled
-def luma_row(surface, y, left, b):
-    """The recorded picture's sRGB luma and its feature of the sky."""
-    top_, left_, _, stride = surface.image_window
-    start = (y - top_) * stride + left - left_
-    width = b.shape[1] - 16
-    image = surface.image[start : start + width]
+def _light(planes, row, curve, width, b):
+    """Linear light of a row, its sRGB luma, and its feature of the sky."""
+    for channel in range(3):
+        for x in range(width):
+            b[channel, x] = curve[planes[channel, row, x]]
     for x in range(width):
         b[LUMA, x] = (
-            np.float32(0.2126 / 255) * np.float32(image[x, 0])
-            + np.float32(0.7152 / 255) * np.float32(image[x, 1])
-            + np.float32(0.0722 / 255) * np.float32(image[x, 2])
+            np.float32(0.2126 / 255) * np.float32(planes[0, row, x])
+            + np.float32(0.7152 / 255) * np.float32(planes[1, row, x])
+            + np.float32(0.0722 / 255) * np.float32(planes[2, row, x])
         )
     red, blue = np.float32(SKY_FEATURE[0] / 255), np.float32(SKY_FEATURE[2] / 255)
     for x in range(width):
-        b[SKYNESS, x] = red * np.float32(image[x, 0]) + blue * np.float32(image[x, 2])
+        b[SKYNESS, x] = red * np.float32(planes[0, row, x]) + blue * np.float32(planes[2, row, x])
 
 
 @compiled
 def _flatten(kinds, table, small, cell, share, look, tint, width, b):
-    """The sun's light and shadow go, by runs of ground and of what stands."""
-    x0 = 0
-    while x0 < width:
-        ground = table[kinds[x0], GROUND] > np.float32(0.0)
-        x1 = x0 + 1
-        while x1 < width and (table[kinds[x1], GROUND] > np.float32(0.0)) == ground:
-            x1 += 1
-        if ground:
-            spread_run(small, GROUND_GAIN, 4, cell, share, x0, x1, b, FREE)
-            _ground_gain(x0, x1, look.flattening, tint, b)
-        else:
-            spread_run(small, OBJECT_GAIN, 2, cell, share, x0, x1, b, FREE)
-            _object_gain(x0, x1, look.flattening, b)
-        x0 = x1
-
-
-@inlined
-def _ground_gain(x0, x1, strength, tint, b):
+    """The sun's light and shadow go."""
     zero = np.float32(0.0)
-    for x in range(x0, x1):
-        gain = b[FREE, x] * b[LUMA, x] + b[FREE + 1, x]
-        gain = max(gain, b[FREE + 2, x])
-        b[FREE, x] = strength * min(gain, b[FREE + 3, x])
-    for channel in range(3):
-        for x in range(x0, x1):
-            gain = b[FREE, x]
-            gain += tint[channel] * max(gain, zero)
-            b[channel, x] *= survival(-gain)
-
-
-@inlined
-def _object_gain(x0, x1, strength, b):
     least, most = OBJECT_GAINS
-    for x in range(x0, x1):
-        gain = b[FREE, x] * b[LUMA, x] + b[FREE + 1, x]
-        b[FREE, x] = survival(-strength * min(max(gain, least), most))
+    for x in range(width):
+        b[GROUNDED, x] = table[kinds[x], GROUND]
+    spread_run(small, GROUND_GAIN, 6, cell, share, np.uint64(0), np.uint64(width), b, FREE)
+    for x in range(width):
+        ground = b[FREE, x] * b[LUMA, x] + b[FREE + 1, x]
+        ground = min(max(ground, b[FREE + 2, x]), b[FREE + 3, x])
+        other = b[FREE + 4, x] * b[LUMA, x] + b[FREE + 5, x]
+        other = min(max(other, least), most)
+        b[FREE, x] = look.flattening * (ground if b[GROUNDED, x] > zero else other)
+    for x in range(width):
+        b[FREE + 1, x] = max(b[FREE, x], zero) * b[GROUNDED, x]
     for channel in range(3):
-        for x in range(x0, x1):
-            b[channel, x] *= b[FREE, x]
+        shift = tint[channel]
+        for x in range(width):
+            b[channel, x] *= survival(-(b[FREE, x] + shift * b[FREE + 1, x]))
 
 
 @compiled
@@ -259,7 +240,7 @@ def _tone(exposure, matrix, width, b):
 def _sky(small, cell, share, left, y, geometry, look, width, b):
     """An overcast sky where the sky is, also between leaves."""
     zero, one = np.float32(0.0), np.float32(1.0)
-    spread_run(small, MATTE, 2, cell, share, 0, width, b, FREE)
+    spread_run(small, MATTE, 2, cell, share, np.uint64(0), np.uint64(width), b, FREE)
     ray_y = (np.float32(y) - geometry.cy) / geometry.fy
     rise = geometry.climb_y * ray_y + geometry.climb_z
     across = one + ray_y * ray_y

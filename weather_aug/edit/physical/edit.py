@@ -54,9 +54,11 @@ def edited(
     """
     look = look_of(weather, ambience, layers.illumination, frame.time_s, without)
     labelled = frame.label is not None
-    _, _, height, width = window
+    top, left, height, width = window
     out = np.empty((3, height, width), np.uint8)
+    part = frame.image[top : top + height, left : left + width]
     dress(
+        np.stack(cv2.split(part)),
         surface_of(frame),
         layers.classes.reshape(-1),
         window,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from weather_aug._compiled import inlined
+from weather_aug._compiled import compiled, inlined
 from weather_aug.edit.physical.buffer import (
     COVERED,
     HEIGHT,
@@ -59,12 +59,13 @@ def covered(amount, fuzz, noise):
     return ramp(threshold - fuzz, threshold + fuzz, noise)
 
 
-@inlined
+@compiled
 def ground_run(run, depth, geometry, look, material, small, cell, share, b):
     """Wet and snow on pixels x0 to x1 of one ground class.
 
     Args:
-        run: (x0, x1, left, y): pixels of the window's row, and where its row starts in the picture.
+        run: (x0, x1, left, y): pixels of the window's row, unsigned (see `spread_run`), and where
+            the row starts in the picture, float32.
         depth: (W,) metres.
         geometry: Of the whole picture.
         look: Weather.
@@ -106,18 +107,18 @@ def _fuzz(size_m):
     return soft if soft < np.float32(0.5) else np.float32(0.5)
 
 
-@inlined
+@compiled
 def _places(run, depth, geometry, b):
     """How flat the pixels are seen, how long they are on the ground, and how high they lie."""
     x0, x1, left, y = run
     one, steepest = np.float32(1.0), np.float32(0.004)
-    ray_y = (np.float32(y) - geometry.cy) / geometry.fy
+    ray_y = (y - geometry.cy) / geometry.fy
     climb_y = geometry.climb_y * ray_y + geometry.climb_z
     per_fx, per_fy = one / geometry.fx, one / geometry.fy
     across = one + ray_y * ray_y
     for x in range(x0, x1):
         z = min(depth[x], np.float32(1e4))
-        ray_x = (np.float32(left + x) - geometry.cx) * per_fx
+        ray_x = (left + np.float32(x) - geometry.cx) * per_fx
         climb = geometry.climb_x * ray_x + climb_y
         sine = max(-climb / np.sqrt(across + ray_x * ray_x), steepest)
         b[SINE, x] = sine
@@ -125,7 +126,7 @@ def _places(run, depth, geometry, b):
         b[HEIGHT, x] = geometry.height_0 + z * climb
 
 
-@inlined
+@compiled
 def _tracks(x0, x1, strength, b):
     """From how far left of the way to how far in a wheel's track; other lanes are driven less."""
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
@@ -138,7 +139,7 @@ def _tracks(x0, x1, strength, b):
         b[SIDE, x] = strength * track * (driven if driven > zero else zero)
 
 
-@inlined
+@compiled
 def film(x0, x1, wet, b):
     """Darken a run under a film of water."""
     least, most, one = np.float32(0.01), np.float32(0.95), np.float32(1.0)
@@ -150,7 +151,7 @@ def film(x0, x1, wet, b):
             b[channel, x] = value * (one + wet * (film_ratio_of(albedo) - one))
 
 
-@inlined
+@compiled
 def _pools(x0, x1, share, b):
     """Standing water; more of it in the ruts."""
     one = np.float32(1.0)
@@ -159,7 +160,7 @@ def _pools(x0, x1, share, b):
         b[POOL, x] = covered(amount, _fuzz(b[SIZE, x]), b[LIE, x])
 
 
-@inlined
+@compiled
 def _shine(x0, x1, shine, labelled, b):
     """How far each pixel's water mirrors; where nobody labelled, only what lies in the plane."""
     one = np.float32(1.0)
@@ -169,7 +170,7 @@ def _shine(x0, x1, shine, labelled, b):
         b[COVERED, x] = shine * (labelled + (one - labelled) * level)
 
 
-@inlined
+@compiled
 def _mirror(x0, x1, flooded_share, b):
     """What the film and the puddles mirror."""
     one = np.float32(1.0)
@@ -189,7 +190,7 @@ def _mirror(x0, x1, flooded_share, b):
             b[channel, x] = kept * b[channel, x] + stones * smeared + calm
 
 
-@inlined
+@compiled
 def _cover(x0, x1, amount, b):
     one = np.float32(1.0)
     for x in range(x0, x1):
@@ -197,7 +198,7 @@ def _cover(x0, x1, amount, b):
         b[COVERED, x] = covered(spared, _fuzz(b[SIZE, x]), b[NOISE, x])
 
 
-@inlined
+@compiled
 def _lay(x0, x1, look, least, b):
     """Snow over what lies there, at `least` of its brightness; a little of that shows through."""
     asphalt = np.float32(ASPHALT_ALBEDO)

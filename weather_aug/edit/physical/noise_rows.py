@@ -89,9 +89,10 @@ def noise_row(surface, classes, y, left, width, geometry, table, tile, pools, kn
 @compiled
 def _between(knots, which, offset, width, b, slot):
     per_knot = np.float32(1.0 / KNOT_PX)
+    start = np.uint32(offset)
     for x in range(width):
-        place = np.int32(offset + x)
-        k = place // np.int32(KNOT_PX)
-        share = np.float32(place - k * np.int32(KNOT_PX)) * per_knot
-        before, after = knots[which, k], knots[which, k + np.int32(1)]
+        place = np.uint32(start + np.uint32(x))
+        k = place // np.uint32(KNOT_PX)
+        share = np.float32(place - k * np.uint32(KNOT_PX)) * per_knot
+        before, after = knots[which, k], knots[which, k + np.uint32(1)]
         b[slot, x] = before + share * (after - before)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from weather_aug._compiled import inlined
+from weather_aug._compiled import compiled, inlined
 from weather_aug.edit.physical.buffer import MIRRORED, POOL, SIZE
 
 CELL_M = 0.14
@@ -20,19 +20,19 @@ ON_POOL, ON_FILM = 0.35, 0.12
 """Largest relative change of what standing water and a film mirror."""
 
 
-@inlined
+@compiled
 def ripple(run, depth, geometry, look, b):
     """Modulate what is mirrored on pixels x0 to x1 of the ground; see `ground_rows.ground_run`."""
     x0, x1, left, y = run
     zero, one = np.float32(0.0), np.float32(1.0)
-    ray_y = (np.float32(y) - geometry.cy) / geometry.fy
+    ray_y = (y - geometry.cy) / geometry.fy
     along_y = geometry.along_y * ray_y + geometry.along_z
     left_y = geometry.left_y * ray_y + geometry.left_z
     for x in range(x0, x1):
         if b[SIZE, x] >= np.float32(COARSEST_M):
             continue
         z = depth[x]
-        ray_x = (np.float32(left + x) - geometry.cx) / geometry.fx
+        ray_x = (left + np.float32(x) - geometry.cx) / geometry.fx
         along = geometry.along_0 + z * (geometry.along_x * ray_x + along_y)
         aside = geometry.left_0 + z * (geometry.left_x * ray_x + left_y)
         fine = one - b[SIZE, x] * np.float32(1.0 / COARSEST_M)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from weather_aug._compiled import compiled, inlined
+from weather_aug._compiled import compiled
 from weather_aug.edit.physical.buffer import (
     BELOW_TOP,
     COVERED,
@@ -56,7 +56,7 @@ def caps_row(kinds, depth, fy, b, class_above):
         class_above[x] = kinds[x]
 
 
-@inlined
+@compiled
 def film_run(run, look, material, small, cell, share, b):
     """Darken wet walls, trunks and clothes."""
     x0, x1, _, _ = run
@@ -64,7 +64,7 @@ def film_run(run, look, material, small, cell, share, b):
     film(x0, x1, look.film * material[POROSITY], b)
 
 
-@inlined
+@compiled
 def standing_run(run, depth, geometry, look, material, small, cell, share, b):
     """Snow on upper edges, level parts and leaves and around the foot; see `ground_run`."""
     x0, x1, _, _ = run
@@ -92,22 +92,22 @@ def standing_run(run, depth, geometry, look, material, small, cell, share, b):
         lay_snow(x, cover, bright / grey, look, b)
 
 
-@inlined
+@compiled
 def _feet(run, depth, geometry, b):
     """Height over the road's plane, as far as it can be known, and metres a pixel."""
     x0, x1, left, y = run
-    ray_y = (np.float32(y) - geometry.cy) / geometry.fy
+    ray_y = (y - geometry.cy) / geometry.fy
     climb_y = geometry.climb_y * ray_y + geometry.climb_z
     per_fx, per_fy = np.float32(1.0) / geometry.fx, np.float32(1.0) / geometry.fy
     for x in range(x0, x1):
         z = depth[x]
-        ray_x = (np.float32(left + x) - geometry.cx) * per_fx
+        ray_x = (left + np.float32(x) - geometry.cx) * per_fx
         height = geometry.height_0 + z * (geometry.climb_x * ray_x + climb_y)
         b[HEIGHT, x] = height if z < np.float32(BURIED_RANGE_M) else np.float32(NO_CAP_M)
         b[SIZE, x] = min(z * per_fy, np.float32(1.0))
 
 
-@inlined
+@compiled
 def _edges(x0, x1, cap_m, snow_depth_m, b):
     """Snow along upper edges."""
     one = np.float32(1.0)
@@ -117,7 +117,7 @@ def _edges(x0, x1, cap_m, snow_depth_m, b):
         b[COVERED, x] = one - ramp(np.float32(0.7) * edge, np.float32(1.2) * edge, b[BELOW_TOP, x])
 
 
-@inlined
+@compiled
 def _levels(x0, x1, amount, b):
     """Snow on bonnets and roofs."""
     for x in range(x0, x1):
@@ -126,7 +126,7 @@ def _levels(x0, x1, amount, b):
         b[COVERED, x] = max(b[COVERED, x], covered(amount * level, fuzz, b[NOISE, x]))
 
 
-@inlined
+@compiled
 def _leaves(x0, x1, amount, exposure, b):
     """Snow on what of a crown is lighter than its surroundings: leaves that face the sky."""
     zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)

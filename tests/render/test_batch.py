@@ -306,7 +306,9 @@ def test_every_option_is_drawn_or_refused():
 
 def test_every_effect_is_drawn_or_left_out():
     """A new effect of `render` has to be thought of here."""
-    drawn = {"relight", "sky", "film", "mirror", "puddles", "snow_cover", "tracks", "exposure"}
+    drawn = {"relight", "sky", "film", "mirror", "puddles"} | {
+        *("ripples", "snow_cover", "tracks", "exposure")
+    }
     assert drawn.isdisjoint(UNDRAWN)
     assert drawn | set(UNDRAWN) == set(EFFECTS)
     assert BATCH_OPTIONS == RenderOptions(without=UNDRAWN)

@@ -1,6 +1,7 @@
 """The edited background in torch: that of the compiled editor, with gradients."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,25 +9,33 @@ import torch
 from batch_scene import AGREEMENT_DB, AMBIENCE, BACKGROUNDS, Case, arguments, batch, psnr, yard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from render_scene import make_camera, make_frame
 
 from weather_aug._compiled import compiled
-from weather_aug.edit.physical.dress import BELOW_TOP
+from weather_aug.edit.physical.buffer import BELOW_TOP
 from weather_aug.edit.physical.fresnel import film_ratio, fresnel
 from weather_aug.edit.physical.noise import PERIOD_M, noise_tile
 from weather_aug.edit.physical.noise import ground_noise as noise_of_kernel
 from weather_aug.edit.physical.standing_rows import caps_row
 from weather_aug.errors import ArgumentError
 from weather_aug.render import batch as batch_module
-from weather_aug.render import batch_dress, batch_dress_ground, batch_dress_standing
+from weather_aug.render import (
+    batch_dress,
+    batch_dress_ground,
+    batch_dress_noise,
+    batch_dress_ripples,
+    batch_dress_standing,
+)
 from weather_aug.render.background import looked_at
 from weather_aug.render.batch import BATCH_OPTIONS, render_batch
 from weather_aug.render.batch_dress import Dressing, looked_at_tensors
 from weather_aug.render.batch_dress_noise import ground_noise
 from weather_aug.render.batch_dress_standing import below_top_m
 from weather_aug.render.options import RenderOptions
+from weather_aug.taxonomy import BUILDING, ROAD
 from weather_aug.weather import Weather
 
-DRAWN = ("relight", "sky", "film", "mirror", "puddles", "snow_cover", "tracks")
+DRAWN = ("relight", "sky", "film", "mirror", "puddles", "ripples", "snow_cover", "tracks")
 ALL_AT_ONCE = Weather(
     overcast=0.9,
     wetness=0.8,
@@ -35,6 +44,27 @@ ALL_AT_ONCE = Weather(
     road_snow_cover=0.5,
     snow_depth_m=0.06,
 )
+
+
+RAIN = Weather(wetness=1.0, puddles=0.6, rain_mm_per_h=9.0)
+
+
+def puddle():
+    """A road so near that its pixels show rings, mirroring what stands at its end."""
+    camera = make_camera(focal_px=300.0)
+    pose = camera.world_from_camera.copy()
+    down = np.deg2rad(35.0)
+    pose[:3, 1] = (-np.sin(down), 0.0, -np.cos(down))
+    pose[:3, 2] = (np.cos(down), 0.0, -np.sin(down))
+    camera = replace(camera, world_from_camera=pose)
+    v, u = np.mgrid[:96, :160]
+    rays = np.stack([(u - 79.5) / 300.0, (v - 47.5) / 300.0, np.ones((96, 160))], axis=-1)
+    depth = 1.5 / -(rays @ pose[2, :3])
+    label = np.full((96, 160), ROAD, np.uint8)
+    label[:10] = BUILDING
+    image = np.random.default_rng(6).integers(60, 90, (96, 160, 3)).astype(np.uint8)
+    image[:10] = 230
+    return make_frame(camera, image, depth, label)
 
 
 @pytest.mark.parametrize("labelled", [True, False])
@@ -51,7 +81,7 @@ def test_agrees_with_the_compiled_editor(labelled):
 @pytest.mark.parametrize("effect", DRAWN)
 def test_leaves_out_what_the_compiled_editor_leaves_out(effect):
     options = replace(BATCH_OPTIONS, without=(*BATCH_OPTIONS.without, effect))
-    case = Case(yard(), ALL_AT_ONCE)
+    case = Case(puddle(), RAIN) if effect == "ripples" else Case(yard(), ALL_AT_ONCE)
     shot = batch([case], options=options).image[0]
     assert psnr(shot, case.alone(options=options).image) >= AGREEMENT_DB
     assert psnr(shot, case.alone().image) < AGREEMENT_DB - 3
@@ -71,12 +101,33 @@ def without_mirror(monkeypatch):
 
 def with_other_noise(monkeypatch):
     wrong = lambda along, left, *rest: ground_noise(left, along, *rest)  # noqa: E731
-    monkeypatch.setattr(batch_dress_ground, "ground_noise", wrong)
+    monkeypatch.setattr(batch_dress_noise, "ground_noise", wrong)
 
 
 def with_finest_noise(monkeypatch):
     wrong = lambda along, left, size, offset: ground_noise(along, left, 0 * size, offset)  # noqa: E731
-    monkeypatch.setattr(batch_dress_ground, "ground_noise", wrong)
+    monkeypatch.setattr(batch_dress_noise, "ground_noise", wrong)
+
+
+def with_knots_of_eight(monkeypatch):
+    monkeypatch.setattr(batch_dress_noise, "KNOT_PX", 8)
+
+
+def without_rings(monkeypatch):
+    monkeypatch.setattr(batch_dress_ground, "rippled", lambda shown, *_: shown)
+
+
+def with_rings_of_another_time(monkeypatch):
+    right = batch_dress_ripples.rings
+
+    def wrong(along_m, left_m, look):
+        return right(along_m, left_m, SimpleNamespace(**vars(look) | {"time_s": 0.1}))
+
+    monkeypatch.setattr(batch_dress_ripples, "rings", wrong)
+
+
+def with_white_slush(monkeypatch):
+    monkeypatch.setattr(batch_dress_ground, "SLUSH", batch_dress_ground.CLEAN)
 
 
 def without_tracks(monkeypatch):
@@ -124,6 +175,8 @@ FAULTS = [
     (with_other_noise, "wet"),
     (with_other_noise, "snowed on"),
     (with_finest_noise, "road snow"),
+    (with_knots_of_eight, "snowed on"),
+    (with_white_slush, "road snow"),
     (without_tracks, "road snow"),
     (without_caps, "snowed on"),
     (with_bare_leaves, "snowed on"),
@@ -138,6 +191,18 @@ FAULTS = [
 @pytest.mark.parametrize(("fault", "name"), FAULTS)
 def test_the_agreement_would_notice(fault, name, monkeypatch):
     case = Case(yard(), BACKGROUNDS[name])
+    fault(monkeypatch)
+    assert psnr(batch([case]).image[0], case.alone().image) < AGREEMENT_DB - 3
+
+
+def test_rings_are_those_of_the_compiled_editor():
+    case = Case(puddle(), RAIN)
+    assert psnr(batch([case]).image[0], case.alone().image) >= AGREEMENT_DB
+
+
+@pytest.mark.parametrize("fault", [without_rings, with_rings_of_another_time])
+def test_the_agreement_of_rings_would_notice(fault, monkeypatch):
+    case = Case(puddle(), RAIN)
     fault(monkeypatch)
     assert psnr(batch([case]).image[0], case.alone().image) < AGREEMENT_DB - 3
 

@@ -219,8 +219,8 @@ def _dressing(
     camera, weather, ambience = job.camera, job.weather, job.ambience
     if layers is None:
         layers = looked_at_tensors(image, depth, label, camera, ambience)
-    without, labelled = job.options.without, label is not None
-    return Dressing.of(layers, depth, camera, weather, ambience, without, labelled=labelled)
+    numbers = (depth, camera, weather, ambience, job.time_s, job.options.without)
+    return Dressing.of(layers, *numbers, labelled=label is not None)
 
 
 def _background(

@@ -16,8 +16,8 @@ from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 NOT_DRAWN = ("preset", "multiple_scattering", "labels")
 """Options that `render` knows and a batch does not: it takes their default only."""
 UNDRAWN = (
-    *("ripples", "lamps", "spray"),
-    *("drops", "wipers", "lens_veil", "noise", "glare", "compression"),
+    *("lamps", "spray", "drops", "wipers", "lens_veil"),
+    *("noise", "glare", "compression"),
 )
 """Effects that a batch does not draw; `without` must name them, so that nothing differs silently.
 "spray" is what single vehicles raise: the layer of spray over the road is drawn."""

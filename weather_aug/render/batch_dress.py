@@ -8,31 +8,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from weather_aug._compiled import compiled
 from weather_aug.clip.types import Camera, Frame, FrameKey
 from weather_aug.edit.ambience import Ambience
-from weather_aug.edit.physical.dress import (
-    GROUND_GAIN,
-    MATTE,
-    OBJECT_GAIN,
-    OBJECT_GAINS,
-)
-from weather_aug.edit.physical.edit import geometry_of, maps_in
-from weather_aug.edit.physical.layers import Layers
+from weather_aug.edit.physical.dress import MAPS, OBJECT_GAINS
+from weather_aug.edit.physical.edit import _tone_tables, geometry_of
+from weather_aug.edit.physical.layer_rows import load_row
+from weather_aug.edit.physical.layers import GROUND_GAIN, MATTE, OBJECT_GAIN, Layers
 from weather_aug.edit.physical.look import look_of
 from weather_aug.edit.physical.materials import GROUND, POROSITY, material_table
-from weather_aug.edit.physical.overcast import tone
+from weather_aug.edit.physical.noise_rows import OTHER_M
 from weather_aug.edit.physical.relight import SKY_FEATURE
 from weather_aug.render.background import looked_at
 from weather_aug.render.batch_dress_grid import Grid, Pixels, plain
 from weather_aug.render.batch_dress_ground import dressed_ground, luminance
+from weather_aug.render.batch_dress_noise import noise_of_rows
 from weather_aug.render.batch_dress_standing import (
-    FARTHEST_M,
     below_top_m,
     holds_snow,
     snowed_standing,
@@ -71,6 +69,16 @@ def looked_at_tensors(
     return looked_at(frame, ambience)
 
 
+@compiled
+def _under_tone(layers: Any, by_root: Any, matrix: Any, look: Any, out: Any) -> None:
+    """All rows of `load_row`."""
+    _, rows, columns = layers.shape
+    scratch = np.empty((4, columns), np.float32)
+    for row in range(rows):
+        cells = (row, np.int64(0), np.int64(columns))
+        load_row(layers, cells, by_root, matrix, look, scratch, out[:, row])
+
+
 @dataclass(frozen=True, eq=False)
 class Dressing:
     """All that a weather does to one picture's surfaces, on the picture's device."""
@@ -82,7 +90,7 @@ class Dressing:
     classes: Tensor
     """(H, W) uint8 train ids, guessed where nobody labelled."""
     table: Tensor
-    """(256, 8) materials."""
+    """(256, 9) materials."""
     maps: Tensor
     """(18, h, w) under the weather's light."""
     sky_cells: NDArray[np.bool_]
@@ -105,15 +113,16 @@ class Dressing:
         camera: Camera,
         weather: Weather,
         ambience: Ambience,
+        time_s: float,
         without: tuple[str, ...],
         *,
         labelled: bool,
     ) -> Dressing:
         """What `edit.physical.edit.edited` gives to its kernels, in the depth's dtype."""
-        look = look_of(weather, ambience, layers.illumination, without)
-        curve, matrix = tone(0.0 if "relight" in without else weather.overcast)
-        window = (0, 0, camera.height, camera.width)
-        maps = maps_in(layers, window, look, curve, matrix)
+        look = look_of(weather, ambience, layers.illumination, time_s, without)
+        curve, by_root, matrix = _tone_tables(0.0 if "relight" in without else weather.overcast)
+        maps = np.zeros((MAPS, *layers.maps.shape[1:]), np.float32)
+        _under_tone(layers.maps.view(np.uint16), by_root, matrix, look, maps)
         classes = torch.tensor(layers.classes, device=depth_m.device)
         geometry = geometry_of(camera, ambience.axes_world, layers.plane, labelled=labelled)
         tops = below_top_m(classes, depth_m, float(geometry.fy)) if look.snow > 0 else None
@@ -160,18 +169,23 @@ class Dressing:
 
     def _pixels(self, depth_m: Tensor, rays: tuple[Tensor, Tensor], rows: slice) -> Pixels:
         count, width = depth_m.shape
+        look = self.look
         place = torch.arange(count * width, device=depth_m.device)
         row, column = place[:count, None], place[None, :width]
-        ray_x, ray_y = (ray.expand(count, width).reshape(-1) for ray in rays)
-        return Pixels(
-            place,
-            row.expand(count, width).reshape(-1),
-            column.expand(count, width).reshape(-1),
-            depth_m.flatten(),
-            ray_x,
-            ray_y,
-            self.table.index_select(0, self.classes[rows].flatten().int()),
+        material = self.table.index_select(0, self.classes[rows].flatten().int())
+        is_ground = (material[:, GROUND] > 0).view_as(depth_m)
+        seen = depth_m, is_ground, rays, self.geometry
+        noise = lie = torch.zeros_like(depth_m)
+        pools = min(look.puddles, look.mirror) > 0
+        if pools or max(look.snow, look.road_snow) > 0:
+            noise = noise_of_rows(*seen, 0.0)
+        if pools:
+            lie = noise_of_rows(*seen, OTHER_M)
+        row, column, depth, ray_x, ray_y = (
+            part.expand(count, width).reshape(-1) for part in (row, column, depth_m, *rays)
         )
+        noise, lie = noise.flatten(), lie.flatten()
+        return Pixels(place, row, column, depth, ray_x, ray_y, material, noise, lie)
 
     def _on_ground(self, recorded: Tensor, srgb: Tensor, pixels: Pixels, grid: Grid) -> Tensor:
         """(3, N) of road, sidewalk and terrain."""
@@ -202,7 +216,7 @@ class Dressing:
             new = wet_standing(light.index_select(1, wet), pixels.at(wet), grid, look)
             light = light.index_copy(1, wet, new)
         if self.below_top_m is not None:
-            white = torch.nonzero(holds_snow(pixels.material) & (pixels.depth_m < FARTHEST_M))[:, 0]
+            white = torch.nonzero(holds_snow(pixels.material))[:, 0]
             mine = pixels.at(white)
             below_m = self.below_top_m[rows].flatten().index_select(0, mine.place)
             old = light.index_select(1, white)

@@ -30,7 +30,11 @@ class Pixels:
     """Tangents of the view."""
     ray_y: Tensor
     material: Tensor
-    """(N, 8) of the pixels' classes; see `edit.physical.materials`."""
+    """(N, 9) of the pixels' classes; see `edit.physical.materials`."""
+    noise: Tensor
+    """In [0, 1]: where snow lies first; zero where none lies."""
+    lie: Tensor
+    """In [0, 1]: where water stands longest; zero where there are no puddles."""
 
     def at(self, index: Tensor) -> Pixels:
         """Some of them, by their indices (M,)."""

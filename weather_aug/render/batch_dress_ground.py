@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from weather_aug.colour import LUMINANCE
-from weather_aug.edit.physical.dress import LIGHT, SHARP
 from weather_aug.edit.physical.fresnel import (
     DIFFUSE_FROM_AIR,
     DIFFUSE_FROM_WATER,
@@ -21,35 +20,41 @@ from weather_aug.edit.physical.fresnel import (
 )
 from weather_aug.edit.physical.ground_rows import (
     ASPHALT_ALBEDO,
+    CLEAN,
+    FLATTEST_SINE,
     GUESSED_HEIGHTS,
     LANE_M,
-    LATERAL,
     MICRO_SLOPE,
+    POOL_DARKENING,
+    RUT_WATER,
+    SLUSH,
     SNOW_ALBEDO,
     TRACK_M,
     WHEEL_M,
 )
+from weather_aug.edit.physical.layers import ILLUMINATION, LATERAL_M, SHARP
 from weather_aug.edit.physical.materials import COVER, MIRROR, POROSITY, ROAD
 from weather_aug.render.batch_dress_grid import Grid, Pixels
-from weather_aug.render.batch_dress_noise import ground_noise
+from weather_aug.render.batch_dress_ripples import rippled
 
-POOL_OFFSET_M = 11.3
-"""Where in the noise water stands, from where snow lies."""
 FARTHEST_M = 1e4
-FLATTEST_SINE, FLATTEST_SIZE_SINE = 0.004, 0.02
+STEEPEST = 0.004
+"""Least sine of the angle between view and road."""
 OTHER_LANES_LESS = 0.45
 SPARED_BY_WHEELS = 0.85
+LIGHTEST = 1.02
+"""Brightness of the lightest snow."""
 
 
 class _Places(NamedTuple):
     """Of ground pixels, (N,) each."""
 
-    along_m: Tensor
-    left_m: Tensor
     sine: Tensor
     """Of the angle between view and road."""
     size_m: Tensor
     """Of the pixel on the road, along it."""
+    height_m: Tensor
+    """Over the road's plane."""
 
 
 def dressed_ground(
@@ -70,29 +75,29 @@ def dressed_ground(
     material = pixels.material
     road = material[:, ROAD] > 0
     amount = torch.where(road, look.road_snow, look.snow * material[:, COVER])
-    (lit,) = grid.at(LIGHT, 1, pixels)
+    (lit,) = grid.at(ILLUMINATION, 1, pixels)
     places = _places(pixels, geometry)
-    noise, tracks = torch.zeros_like(lit), torch.zeros_like(lit)
-    snowy = max(look.road_snow, look.snow) > 0
-    if snowy or look.puddles > 0:
-        noise = ground_noise(places.along_m, places.left_m, places.size_m, 0.0)
-        (lateral_m,) = grid.at(LATERAL, 1, pixels)
-        tracks = torch.where(road, look.tracks * tracks_at(lateral_m, noise), 0.0)
+    (lateral_m,) = grid.at(LATERAL_M, 1, pixels)
+    tracks = torch.where(road, look.tracks * tracks_at(lateral_m, pixels.noise), 0.0)
     if look.film > 0:
         light = film(light, lit, look.film * material[:, POROSITY])
     if look.mirror > 0:
-        pool = torch.zeros_like(lit)
-        if look.puddles > 0:
-            lie = ground_noise(places.along_m, places.left_m, places.size_m, POOL_OFFSET_M)
-            pool = covered(look.puddles * (1.0 + 1.5 * tracks), _fuzz(places.size_m), lie)
-            pool = torch.where(road, pool, 0.0)
-        shine = look.mirror * material[:, MIRROR] * _level(pixels, geometry)
+        pools = torch.where(road, look.puddles * (1.0 + RUT_WATER * tracks), 0.0)
+        pool = covered(pools, _fuzz(places.size_m), pixels.lie)
+        level = 1.0 - ramp(*GUESSED_HEIGHTS, places.height_m)
+        level = geometry.labelled + (1.0 - geometry.labelled) * level
+        shine = look.mirror * material[:, MIRROR] * level
         shown = grid.at(SHARP, 6, pixels)
+        if look.ripples > 0:
+            shown = rippled(shown, pool, places.size_m, pixels, geometry, look)
         light = _mirrored(light, shown, pool, shine, places.sine, look.flooded)
-    if snowy:
+    if max(look.road_snow, look.snow) > 0:
         spared = amount * (1.0 - SPARED_BY_WHEELS * tracks)
-        cover = covered(spared, _fuzz(places.size_m), noise)
-        light = _snowed(light, lit, cover, noise, look)
+        cover = covered(spared, _fuzz(places.size_m), pixels.noise)
+        least = torch.where(road, SLUSH, CLEAN).to(lit.dtype)
+        under = (luminance(light) / (ASPHALT_ALBEDO * lit)).clamp(max=2.0)
+        shade = (least + (LIGHTEST - least) * pixels.noise) * (0.95 + 0.05 * under)
+        light = laid(light, cover, snow_light(lit, look) * shade, look)
     return light
 
 
@@ -115,17 +120,11 @@ def _fuzz(size_m: Tensor) -> Tensor:
 
 def _places(pixels: Pixels, geometry: SimpleNamespace) -> _Places:
     z = pixels.depth_m.clamp(max=FARTHEST_M)
-    along = pixels.towards(geometry.along_x, geometry.along_y, geometry.along_z)
-    left = pixels.towards(geometry.left_x, geometry.left_y, geometry.left_z)
     climb = pixels.towards(geometry.climb_x, geometry.climb_y, geometry.climb_z)
     across = 1.0 + pixels.ray_y * pixels.ray_y
-    sine = (-climb / torch.sqrt(across + pixels.ray_x * pixels.ray_x)).clamp(min=FLATTEST_SINE)
-    return _Places(
-        geometry.along_0 + z * along,
-        geometry.left_0 + z * left,
-        sine,
-        z / geometry.fy / sine.clamp(min=FLATTEST_SIZE_SINE),
-    )
+    sine = (-climb / torch.sqrt(across + pixels.ray_x * pixels.ray_x)).clamp(min=STEEPEST)
+    size_m = z / geometry.fy / sine.clamp(min=FLATTEST_SINE)
+    return _Places(sine, size_m, geometry.height_0 + z * climb)
 
 
 def tracks_at(lateral_m: Tensor, noise: Tensor) -> Tensor:
@@ -150,16 +149,6 @@ def film(light: Tensor, lit: Tensor, wet: Tensor) -> Tensor:
     return light * (1.0 + wet * (ratio - 1.0))
 
 
-def _level(pixels: Pixels, geometry: SimpleNamespace) -> Tensor | float:
-    """Share of the mirror that a pixel's height over the road leaves: guesses may be wrong."""
-    if geometry.labelled:
-        return 1.0
-    climb = pixels.towards(geometry.climb_x, geometry.climb_y, geometry.climb_z)
-    # Endless depth times a level view would be no number.
-    height_m = geometry.height_0 + pixels.depth_m.clamp(max=FARTHEST_M) * climb
-    return 1.0 - ramp(*GUESSED_HEIGHTS, height_m)
-
-
 def _mirrored(
     light: Tensor, shown: Tensor, pool: Tensor, shine: Tensor, sine: Tensor, flooded_share: float
 ) -> Tensor:
@@ -168,7 +157,7 @@ def _mirrored(
     rough = fresnel_of_sine(torch.sqrt(sine * sine + MICRO_SLOPE * MICRO_SLOPE))
     stones = shine * (1.0 - flooded) * 0.5 * rough
     calm = shine * flooded * fresnel_of_sine(sine)
-    kept = (1.0 - stones - calm) * (1.0 - 0.2 * pool)
+    kept = (1.0 - stones - calm) * (1.0 - POOL_DARKENING * pool)
     sharp, smeared = shown[:3], shown[3:]
     return kept * light + stones * smeared + calm * (smeared + pool * (sharp - smeared))
 
@@ -180,15 +169,6 @@ def fresnel_of_sine(sine: Tensor) -> Tensor:
     across = (inside - sine) / (inside + sine)
     along = (index2 * sine - inside) / (index2 * sine + inside)
     return 0.5 * (across * across + along * along)
-
-
-def _snowed(
-    light: Tensor, lit: Tensor, cover: Tensor, noise: Tensor, look: SimpleNamespace
-) -> Tensor:
-    """Snow over what lies there; a little of it shows through."""
-    under = (luminance(light) / (ASPHALT_ALBEDO * lit)).clamp(max=2.0)
-    shade = (0.90 + 0.12 * noise) * (0.95 + 0.05 * under)
-    return laid(light, cover, snow_light(lit, look) * shade, look)
 
 
 def luminance(light: Tensor) -> Tensor:

@@ -1,8 +1,9 @@
-"""World-anchored noise in torch; the look-ups of `weather_aug.edit.physical.noise`."""
+"""World-anchored noise in torch; the look-ups of `edit.physical.noise` and `.noise_rows`."""
 
 from __future__ import annotations
 
 from functools import cache
+from types import SimpleNamespace
 
 import torch
 from torch import Tensor
@@ -16,9 +17,52 @@ from weather_aug.edit.physical.noise import (
     TILE_CELLS,
     noise_tile,
 )
+from weather_aug.edit.physical.noise_rows import FARTHEST_M, FLATTEST_SINE, KNOT_PX, OBLIQUE
 
 COARSER_LEVELS = 4
 """By so many copies the tile is finer at the coarse look, which is 16 times as large."""
+
+
+@torch.no_grad()
+def noise_of_rows(
+    depth_m: Tensor,
+    is_ground: Tensor,
+    rays: tuple[Tensor, Tensor],
+    geometry: SimpleNamespace,
+    offset_m: float,
+) -> Tensor:
+    """Noise (R, W) of the places that some rows show, straight between every fourth column.
+
+    Args:
+        depth_m: (R, W), `inf` for what is far.
+        is_ground: (R, W) bool.
+        rays: Tangents (1, W) and (R, 1).
+        geometry: `edit.physical.dress.Geometry` of the whole picture, plain.
+        offset_m: Of `ground_noise`.
+    """
+    width = depth_m.shape[1]
+    column = torch.arange(width, device=depth_m.device)
+    knot = (KNOT_PX * torch.arange((width - 1) // KNOT_PX + 2, device=depth_m.device)).clamp(
+        max=width - 1
+    )
+    x, y, z = rays[0][:, knot], rays[1], depth_m[:, knot]
+    known = z < FARTHEST_M
+    z = z.clamp(max=FARTHEST_M)
+    along = geometry.along_x * x + (geometry.along_y * y + geometry.along_z)
+    left = geometry.left_x * x + (geometry.left_y * y + geometry.left_z)
+    climb = geometry.climb_x * x + (geometry.climb_y * y + geometry.climb_z)
+    sine = (-climb / torch.sqrt(1.0 + y * y + x * x)).clamp(min=FLATTEST_SINE)
+    low = is_ground[:, knot]
+    slope = torch.where(low, 0.0, OBLIQUE * (geometry.height_0 + z * climb))
+    size = z / geometry.fy
+    size = torch.where(low, size / sine, KNOT_PX * size)
+    along_m = geometry.along_0 + z * along + slope
+    left_m = geometry.left_0 + z * left + slope
+    noise = ground_noise(along_m.flatten(), left_m.flatten(), size.flatten(), offset_m)
+    noise = torch.where(known, noise.view_as(z), 0.5)
+    before = column // KNOT_PX
+    share = (column - KNOT_PX * before).to(noise.dtype) / KNOT_PX
+    return torch.lerp(noise[:, before], noise[:, before + 1], share.expand_as(depth_m))
 
 
 @torch.no_grad()

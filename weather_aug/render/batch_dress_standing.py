@@ -10,14 +10,11 @@ from types import SimpleNamespace
 import torch
 from torch import Tensor
 
-from weather_aug.edit.physical.dress import LIGHT, NO_CAP_M
-from weather_aug.edit.physical.materials import CAP_M, COVER, LEAF, LEVEL, POROSITY
-from weather_aug.edit.physical.standing_rows import BURIED_RANGE_M, OBLIQUE
+from weather_aug.edit.physical.layers import ILLUMINATION
+from weather_aug.edit.physical.materials import BURIED, CAP_M, COVER, LEAF, LEVEL, POROSITY
+from weather_aug.edit.physical.standing_rows import BURIED_RANGE_M, GRAIN_NOISE, NO_CAP_M
 from weather_aug.render.batch_dress_grid import Grid, Pixels
 from weather_aug.render.batch_dress_ground import covered, film, laid, luminance, ramp, snow_light
-from weather_aug.render.batch_dress_noise import ground_noise
-
-FARTHEST_M = 1e4
 
 
 @torch.no_grad()
@@ -51,7 +48,7 @@ def holds_snow(material: Tensor) -> Tensor:
 
 def wet_standing(light: Tensor, pixels: Pixels, grid: Grid, look: SimpleNamespace) -> Tensor:
     """Light (3, N) of wet walls, trunks and clothes."""
-    (lit,) = grid.at(LIGHT, 1, pixels)
+    (lit,) = grid.at(ILLUMINATION, 1, pixels)
     return film(light, lit, look.film * pixels.material[:, POROSITY])
 
 
@@ -67,7 +64,7 @@ def snowed_standing(
 
     Args:
         light: (3, N) linear light.
-        pixels: That hold snow, at finite depths.
+        pixels: That hold snow.
         below_m: (N,) of `below_top_m`.
         grid: The editor's maps under the weather's light.
         geometry: `edit.physical.dress.Geometry` of the whole picture, plain.
@@ -76,37 +73,32 @@ def snowed_standing(
     Returns:
         (3, N).
     """
-    z, material = pixels.depth_m, pixels.material
-    lit, mean, facing_up = grid.at(LIGHT, 3, pixels)
+    z, material, noise = pixels.depth_m, pixels.material, pixels.noise
+    lit, mean, facing_up = grid.at(ILLUMINATION, 3, pixels)
     climb = pixels.towards(geometry.climb_x, geometry.climb_y, geometry.climb_z)
-    along = pixels.towards(geometry.along_x, geometry.along_y, geometry.along_z)
-    left = pixels.towards(geometry.left_x, geometry.left_y, geometry.left_z)
-    height_m = geometry.height_0 + z * climb
-    slope_m, size_m = OBLIQUE * height_m, z / geometry.fy
-    noise = ground_noise(
-        geometry.along_0 + z * along + slope_m, geometry.left_0 + z * left + slope_m, size_m, 0.0
-    )
+    # Farther off nothing is buried; endless depth times a level view would be no number.
+    height_m = geometry.height_0 + z.clamp(max=BURIED_RANGE_M) * climb
+    size_m = (z / geometry.fy).clamp(max=1.0)
     lit = lit.clamp(min=0.02)
-    mean = mean.clamp(min=0.002)
     amount = look.snow * material[:, COVER]
     leaf = material[:, LEAF] > 0
-    here = luminance(light) / (mean * look.exposure)
+    brightness = luminance(light) / (mean.clamp(min=0.002) * look.exposure)
     cover = torch.where(
         leaf,
-        _on_leaves(here, amount, noise),
+        _on_leaves(brightness, amount, noise),
         _on_edges(below_m, facing_up, amount, size_m, noise, material, look),
     )
-    buried = height_m < look.snow_depth_m * (0.6 + 0.8 * noise)
-    cover = torch.where(buried & (z < BURIED_RANGE_M), cover.clamp(min=look.snow), cover)
+    buried = (height_m < look.snow_depth_m * (0.6 + 0.8 * noise)) & (z < BURIED_RANGE_M)
+    foot = torch.where(buried, look.snow * material[:, BURIED], 0.0)
     bright = snow_light(lit, look) * (0.81 + 0.11 * noise)
     shaded = torch.where(leaf, (0.25 + 4.0 * mean / lit).clamp(max=0.85), 1.0)
-    return laid(light, cover, bright * shaded, look)
+    return laid(light, torch.maximum(cover, foot), bright * shaded, look)
 
 
 def _on_leaves(brightness: Tensor, amount: Tensor, noise: Tensor) -> Tensor:
     """Cover of a crown, the bright parts first; `brightness` is over the mean around it."""
     detail = (0.5 + 0.7 * (brightness - 1.0)).clamp(0.0, 1.0)
-    return covered(0.8 * amount, 0.2, 0.25 * noise + 0.75 * detail)
+    return covered(0.8 * amount, 0.2, detail + GRAIN_NOISE * (noise - detail))
 
 
 def _on_edges(
@@ -119,7 +111,7 @@ def _on_edges(
     look: SimpleNamespace,
 ) -> Tensor:
     """Cover of a cap on the upper edge and of level parts."""
-    edge_m = material[:, CAP_M] * look.snow * (0.6 + 0.8 * noise) + 0.4 * look.snow_depth_m
+    edge_m = look.snow * material[:, CAP_M] * (0.6 + 0.8 * noise) + 0.4 * look.snow_depth_m + 1e-6
     cap = 1.0 - ramp(0.7 * edge_m, 1.2 * edge_m, below_m)
     level = ramp(0.55, 0.85, facing_up)
     lies = covered(amount * level, 0.07 + 0.25 * size_m, noise)

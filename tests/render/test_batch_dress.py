@@ -46,19 +46,19 @@ ALL_AT_ONCE = Weather(
 )
 
 
-RAIN = Weather(wetness=1.0, puddles=0.6, rain_mm_per_h=9.0)
+RAIN = Weather(wetness=1.0, puddles=0.9, rain_mm_per_h=10.0)
 
 
 def puddle():
     """A road so near that its pixels show rings, mirroring what stands at its end."""
-    camera = make_camera(focal_px=300.0)
+    camera = make_camera(focal_px=4000.0)
     pose = camera.world_from_camera.copy()
-    down = np.deg2rad(35.0)
+    down = np.deg2rad(14.0)
     pose[:3, 1] = (-np.sin(down), 0.0, -np.cos(down))
     pose[:3, 2] = (np.cos(down), 0.0, -np.sin(down))
     camera = replace(camera, world_from_camera=pose)
     v, u = np.mgrid[:96, :160]
-    rays = np.stack([(u - 79.5) / 300.0, (v - 47.5) / 300.0, np.ones((96, 160))], axis=-1)
+    rays = np.stack([(u - 79.5) / 4000.0, (v - 47.5) / 4000.0, np.ones((96, 160))], axis=-1)
     depth = 1.5 / -(rays @ pose[2, :3])
     label = np.full((96, 160), ROAD, np.uint8)
     label[:10] = BUILDING

@@ -75,7 +75,7 @@ def _under_tone(layers: Any, by_root: Any, matrix: Any, look: Any, out: Any) -> 
     _, rows, columns = layers.shape
     scratch = np.empty((4, columns), np.float32)
     for row in range(rows):
-        cells = (row, np.int64(0), np.int64(columns))
+        cells = (row, np.uint64(0), np.uint64(columns))
         load_row(layers, cells, by_root, matrix, look, scratch, out[:, row])
 
 
@@ -175,11 +175,10 @@ class Dressing:
         material = self.table.index_select(0, self.classes[rows].flatten().int())
         is_ground = (material[:, GROUND] > 0).view_as(depth_m)
         seen = depth_m, is_ground, rays, self.geometry
-        noise = lie = torch.zeros_like(depth_m)
-        pools = min(look.puddles, look.mirror) > 0
-        if pools or max(look.snow, look.road_snow) > 0:
+        noise = lie = torch.full_like(depth_m, 0.5)
+        if max(look.snow, look.road_snow) > 0:
             noise = noise_of_rows(*seen, 0.0)
-        if pools:
+        if min(look.puddles, look.mirror) > 0:
             lie = noise_of_rows(*seen, OTHER_M)
         row, column, depth, ray_x, ray_y = (
             part.expand(count, width).reshape(-1) for part in (row, column, depth_m, *rays)

@@ -32,9 +32,9 @@ class Pixels:
     material: Tensor
     """(N, 9) of the pixels' classes; see `edit.physical.materials`."""
     noise: Tensor
-    """In [0, 1]: where snow lies first; zero where none lies."""
+    """In [0, 1]: where snow lies first; 1/2 where none lies."""
     lie: Tensor
-    """In [0, 1]: where water stands longest; zero where there are no puddles."""
+    """In [0, 1]: where water stands longest; 1/2 where there are no puddles."""
 
     def at(self, index: Tensor) -> Pixels:
         """Some of them, by their indices (M,)."""

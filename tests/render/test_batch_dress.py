@@ -28,9 +28,10 @@ from weather_aug.render import (
 )
 from weather_aug.render.background import looked_at
 from weather_aug.render.batch import BATCH_OPTIONS, render_batch
-from weather_aug.render.batch_dress import Dressing, looked_at_tensors
+from weather_aug.render.batch_dress import Dressing
 from weather_aug.render.batch_dress_noise import ground_noise
 from weather_aug.render.batch_dress_standing import below_top_m
+from weather_aug.render.batch_label import frame_of
 from weather_aug.render.options import RenderOptions
 from weather_aug.taxonomy import BUILDING, ROAD
 from weather_aug.weather import Weather
@@ -220,22 +221,10 @@ def test_nobody_looks_at_a_picture_whose_background_stays(monkeypatch):
     def refuse(*_):
         raise AssertionError
 
-    monkeypatch.setattr(batch_module, "looked_at_tensors", refuse)
+    monkeypatch.setattr(batch_module, "looked_at", refuse)
     batch([Case(yard(), Weather(visibility_m=100.0))])
     with pytest.raises(AssertionError):
         batch([Case(yard(), Weather(overcast=0.5))])
-
-
-def test_ids_that_are_no_train_ids_hold_nothing():
-    inputs = arguments([Case(yard(), BACKGROUNDS["after snow"])])
-    image, depth, label = (inputs[name][0] for name in ("images", "depth_m", "labels"))
-    camera = inputs["cameras"][0]
-    wide = label.long().clone()
-    wide[60:70, :50], label[60:70, :50] = -1, 255
-    wide[60:70, 50:90], label[60:70, 50:90] = 256, 255
-    found = looked_at_tensors(image, depth, wide, camera, AMBIENCE)
-    expected = looked_at_tensors(image, depth, label, camera, AMBIENCE)
-    np.testing.assert_array_equal(expected.classes, found.classes)
 
 
 def directional(weather, labelled):
@@ -243,15 +232,9 @@ def directional(weather, labelled):
     inputs = arguments([Case(yard(labelled=labelled), weather)], torch.float64)
     # Off the 8-bit levels, where the interpolated tone curve has its kinks.
     images = (inputs.pop("images") * (254 / 255) + 0.3 / 255).requires_grad_()
-    inputs["layers"] = [
-        looked_at_tensors(
-            images[0],
-            inputs["depth_m"][0],
-            None if inputs["labels"] is None else inputs["labels"][0],
-            inputs["cameras"][0],
-            AMBIENCE,
-        )
-    ]
+    label = None if inputs["labels"] is None else inputs["labels"][0]
+    frame = frame_of(images[0], inputs["depth_m"][0], label, inputs["cameras"][0], 0.0)
+    inputs["layers"] = [looked_at(frame, AMBIENCE)]
     draw = torch.Generator().manual_seed(4)
     step, weight = (torch.rand(images.shape, generator=draw).double() for _ in range(2))
 

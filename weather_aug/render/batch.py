@@ -25,13 +25,14 @@ from torch import Tensor
 from weather_aug._checks import finite
 from weather_aug._keys import check_seed
 from weather_aug.air import Air, air_of
-from weather_aug.clip.types import FAR_DEPTH_M, Camera
+from weather_aug.clip.types import FAR_DEPTH_M, Camera, Frame
 from weather_aug.colour import SRGB_LEVELS_LINEAR
 from weather_aug.edit.ambience import Ambience
 from weather_aug.edit.physical.layers import Layers
 from weather_aug.edit.physical.look import changes_background
 from weather_aug.particles.shelter import Shelter
 from weather_aug.render import batch_shade
+from weather_aug.render.background import looked_at
 from weather_aug.render.batch_checks import (
     BATCH_OPTIONS,
     check_cameras,
@@ -40,8 +41,9 @@ from weather_aug.render.batch_checks import (
     check_tensors,
     one_each,
 )
-from weather_aug.render.batch_dress import Dressing, looked_at_tensors
+from weather_aug.render.batch_dress import Dressing
 from weather_aug.render.batch_fog import fog_shares
+from weather_aug.render.batch_label import frame_of, honest
 from weather_aug.render.batch_medium import AirColumn, pixel_rays
 from weather_aug.render.batch_particles import Job, Particles, particle_layer, splatting_on
 from weather_aug.render.batch_splat import Layer
@@ -64,9 +66,10 @@ class RenderedBatch:
     image: Tensor
     """(B, 3, H, W) sRGB in [0, 1], of the images' dtype; not quantised."""
     label: Tensor | None
-    """(B, H, W) train ids, 255 where the surface cannot be seen; None where none were given."""
+    """(B, H, W) train ids, by `RenderOptions.labels` 255 where the surface cannot be seen; None
+    where none were given."""
     invalid: Tensor
-    """(B, H, W) uint8, 1 where the surface is undetectable or beyond the optical range."""
+    """(B, H, W) uint8, 1 where a surface cannot be told; see `RenderedFrame.invalid`."""
     transmittance: Tensor
     """(B, H, W) share of the surface's light that reaches the pixel, in [0, 1]."""
     depth: Tensor
@@ -93,8 +96,8 @@ def render_batch(
     """Render each picture of a batch in its own weather, on the images' device.
 
     What the editor knows of a picture, the particles and the uneven fog are those of `render`, made
-    on the CPU and uploaded; everything per pixel is torch. See the module's text for what is equal
-    to `render` bit by bit.
+    on the CPU and uploaded; all light is torch. Labels are judged on the CPU. See the module's text
+    for what is equal to `render` bit by bit.
 
     Convention:
         Gradients flow from `image` to `images`, also through the edited background, and nowhere
@@ -192,7 +195,8 @@ def _rendered(
     particles = Particles.of(job)
     air = AirColumn.of(particles.medium, particles.optics, particles.carried, image)
     rays = pixel_rays(job.camera, image)
-    dressing = _dressing(image, depth, label, layers, job)
+    frame = frame_of(image, depth, label, job.camera, job.time_s)
+    dressing = _dressing(frame, depth, layers, job)
     clear = _clear_share(depth, rays, air, job)
     layer = particle_layer(particles, air, depth.float())
     at_once = ROWS_AT_ONCE if image.device.type == "cpu" else len(depth)
@@ -204,23 +208,19 @@ def _rendered(
     shaded, gap = (torch.cat(parts, dim=-2) for parts in zip(*bands, strict=True))
     through = clear * layer.through.to(clear.dtype)
     distinct = gap * through >= least_linear_contrast(job.ambience.airlight)
-    honest, invalid = batch_shade.readable(
-        label, torch.isinf(depth), through, distinct, layer.covered
-    )
-    return _Shot(shaded, honest, invalid, through)
+    read, invalid = honest(label, frame, through, distinct, layer.covered, job.weather, job.options)
+    return _Shot(shaded, read, invalid, through)
 
 
-def _dressing(
-    image: Tensor, depth: Tensor, label: Tensor | None, layers: Layers | None, job: Job
-) -> Dressing | None:
+def _dressing(frame: Frame, depth: Tensor, layers: Layers | None, job: Job) -> Dressing | None:
     """How the weather changes the background, or None where it leaves it as it is."""
     if not changes_background(job.weather, job.options.without):
         return None
     camera, weather, ambience = job.camera, job.weather, job.ambience
     if layers is None:
-        layers = looked_at_tensors(image, depth, label, camera, ambience)
+        layers = looked_at(frame, ambience)
     numbers = (depth, camera, weather, ambience, job.time_s, job.options.without)
-    return Dressing.of(layers, *numbers, labelled=label is not None)
+    return Dressing.of(layers, *numbers, labelled=frame.label is not None)
 
 
 def _background(

@@ -13,7 +13,7 @@ from weather_aug.edit.physical.layers import Layers
 from weather_aug.errors import ArgumentError
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 
-NOT_DRAWN = ("preset", "multiple_scattering", "labels")
+NOT_DRAWN = ("preset", "multiple_scattering")
 """Options that `render` knows and a batch does not: it takes their default only."""
 UNDRAWN = (
     *("lamps", "spray", "drops", "wipers", "lens_veil"),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from weather_aug._compiled import compiled
-from weather_aug.clip.types import Camera, Frame, FrameKey
+from weather_aug.clip.types import Camera
 from weather_aug.edit.ambience import Ambience
 from weather_aug.edit.physical.dress import MAPS, OBJECT_GAINS
 from weather_aug.edit.physical.edit import _tone_tables, geometry_of
@@ -26,7 +26,6 @@ from weather_aug.edit.physical.look import look_of
 from weather_aug.edit.physical.materials import GROUND, POROSITY, material_table
 from weather_aug.edit.physical.noise_rows import OTHER_M
 from weather_aug.edit.physical.relight import SKY_FEATURE
-from weather_aug.render.background import looked_at
 from weather_aug.render.batch_dress_grid import Grid, Pixels, plain
 from weather_aug.render.batch_dress_ground import dressed_ground, luminance
 from weather_aug.render.batch_dress_noise import noise_of_rows
@@ -37,36 +36,7 @@ from weather_aug.render.batch_dress_standing import (
     wet_standing,
 )
 from weather_aug.render.batch_shade import decoded
-from weather_aug.taxonomy import IGNORE
 from weather_aug.weather import Weather
-
-
-def looked_at_tensors(
-    image: Tensor, depth_m: Tensor, label: Tensor | None, camera: Camera, ambience: Ambience
-) -> Layers:
-    """What the editor knows of a picture in tensors, found out now on the CPU, in whole levels.
-
-    Args:
-        image: (3, H, W) sRGB in [0, 1].
-        depth_m: (H, W), `inf` for what is far.
-        label: (H, W) train ids; what is outside [0, 255] counts as 255.
-        camera: Of the picture.
-        ambience: Light and axes of the scene.
-    """
-    levels = (image.detach() * 255.0).round().to(torch.uint8).permute(1, 2, 0)
-    train_ids = None
-    if label is not None:
-        known = (label >= 0) & (label <= IGNORE)
-        train_ids = label.where(known, torch.full_like(label, IGNORE)).to(torch.uint8).cpu().numpy()
-    frame = Frame(
-        FrameKey(0, "batch"),
-        0.0,
-        camera,
-        np.ascontiguousarray(levels.cpu().numpy()),
-        train_ids,
-        depth_m.float().cpu().numpy(),
-    )
-    return looked_at(frame, ambience)
 
 
 @compiled

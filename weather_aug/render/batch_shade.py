@@ -1,4 +1,4 @@
-"""Decoding, fog, encoding and labels of a picture in torch; the formulas of `render.shade`.
+"""Decoding, fog and encoding of a picture in torch; the formulas of `render.shade`.
 
 Differentiable with respect to the picture.
 """
@@ -7,15 +7,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn import functional
-
-from weather_aug.render.label import (
-    DOUBTFUL_TRANSMITTANCE,
-    HAZY_TRANSMITTANCE,
-    LEAST_TRANSMITTANCE,
-    NEIGHBOURHOOD_PX,
-)
-from weather_aug.taxonomy import IGNORE, SKY
 
 
 def decoded(image: Tensor, curve: Tensor) -> Tensor:
@@ -43,35 +34,3 @@ def encoded(light: Tensor) -> Tensor:
     light = light.clamp(0.0, 1.0)
     power = 1.055 * light.clamp(min=0.0031308) ** (1.0 / 2.4) - 0.055
     return torch.where(light <= 0.0031308, 12.92 * light, power)
-
-
-def neighbourhood(mask: Tensor) -> Tensor:
-    """(H, W) bool: true where the mask is within 7 x 7 pixels."""
-    rim = NEIGHBOURHOOD_PX // 2
-    grown = functional.pad(mask, (rim, rim, rim, rim))
-    for side in (0, 1):
-        # Windows of 2, 4 and 7 pixels, each the union of two of the ones before.
-        for step in (1, 2, NEIGHBOURHOOD_PX - 4):
-            count = grown.shape[side] - step
-            grown = grown.narrow(side, 0, count) | grown.narrow(side, step, count)
-    return grown
-
-
-def readable(
-    label: Tensor | None, far: Tensor, through: Tensor, distinct: Tensor, covered: Tensor
-) -> tuple[Tensor | None, Tensor]:
-    """Label for training (H, W) and invalid mask (H, W) uint8, by the rules of `render.label`.
-
-    Args:
-        label: (H, W) train ids of the clear picture, or None.
-        far: (H, W) bool, where the depth is endless: the sky, where nobody labelled.
-        through: (H, W) share of the surface's light that reaches the pixel.
-        distinct: (H, W) bool, where it still differs visibly from the airlight.
-        covered: (H, W) bool, where a large particle hides the surface.
-    """
-    surface = ~far if label is None else label != SKY
-    near_distinct = neighbourhood(distinct & surface)
-    lost = (through < LEAST_TRANSMITTANCE) | ((through < HAZY_TRANSMITTANCE) & ~near_distinct)
-    unseen = (surface & lost) | covered
-    invalid = (unseen | (surface & (through < DOUBTFUL_TRANSMITTANCE))).to(torch.uint8)
-    return None if label is None else label.masked_fill(unseen, IGNORE), invalid

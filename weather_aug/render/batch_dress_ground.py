@@ -27,9 +27,13 @@ from weather_aug.edit.physical.ground_rows import (
     MICRO_SLOPE,
     POOL_DARKENING,
     RUT_WATER,
+    SHOWING_THROUGH,
     SLUSH,
     SNOW_ALBEDO,
+    TRACK_COVER,
     TRACK_M,
+    TRACK_SOFTNESS,
+    WANDER_M,
     WHEEL_M,
 )
 from weather_aug.edit.physical.layers import ILLUMINATION, LATERAL_M, SHARP
@@ -41,7 +45,6 @@ FARTHEST_M = 1e4
 STEEPEST = 0.004
 """Least sine of the angle between view and road."""
 OTHER_LANES_LESS = 0.45
-SPARED_BY_WHEELS = 0.85
 LIGHTEST = 1.02
 """Brightness of the lightest snow."""
 
@@ -92,11 +95,14 @@ def dressed_ground(
             shown = rippled(shown, pool, places.size_m, pixels, geometry, look)
         light = _mirrored(light, shown, pool, shine, places.sine, look.flooded)
     if max(look.road_snow, look.snow) > 0:
-        spared = amount * (1.0 - SPARED_BY_WHEELS * tracks)
-        cover = covered(spared, _fuzz(places.size_m), pixels.noise)
+        left = amount * (1.0 - (1.0 - TRACK_COVER) * tracks)
+        softness = torch.where(road, TRACK_SOFTNESS, 0.0).to(lit.dtype)
+        cover = covered(left, _fuzz(places.size_m) + softness, pixels.noise)
         least = torch.where(road, SLUSH, CLEAN).to(lit.dtype)
         under = (luminance(light) / (ASPHALT_ALBEDO * lit)).clamp(max=2.0)
-        shade = (least + (LIGHTEST - least) * pixels.noise) * (0.95 + 0.05 * under)
+        shade = (least + (LIGHTEST - least) * pixels.noise) * (
+            1.0 - SHOWING_THROUGH + SHOWING_THROUGH * under
+        )
         light = laid(light, cover, snow_light(lit, look) * shade, look)
     return light
 
@@ -134,10 +140,10 @@ def tracks_at(lateral_m: Tensor, noise: Tensor) -> Tensor:
         lateral_m: (N,) how far left of the driven way, metres.
         noise: (N,) by which tracks wander.
     """
-    side = lateral_m + 0.5 * (noise - 0.5)
+    side = lateral_m + WANDER_M * (noise - 0.5)
     lane = torch.floor(side * (1.0 / LANE_M) + 0.5)
     off = ((side - LANE_M * lane).abs() - WHEEL_M).abs()
-    track = 1.0 - ramp(0.5 * TRACK_M, 1.5 * TRACK_M, off)
+    track = 1.0 - ramp(0.3 * TRACK_M, 1.7 * TRACK_M, off)
     return track * (1.0 - OTHER_LANES_LESS * lane.abs()).clamp(min=0.0)
 
 

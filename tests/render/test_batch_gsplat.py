@@ -11,7 +11,7 @@ from batch_scene import WEATHERS, Case, arguments, street
 
 from weather_aug.errors import MissingExtraError
 from weather_aug.render import batch_gsplat, batch_particles, batch_splat
-from weather_aug.render.batch import render_batch
+from weather_aug.render.batch import BATCH_OPTIONS, render_batch
 from weather_aug.render.batch_gsplat import splat_in_slabs, surfaces_under
 from weather_aug.render.batch_splat import empty_layer, splat
 
@@ -28,7 +28,9 @@ def scene():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(batch_particles, "splat", catch)
-        render_batch(**arguments([case]))
+        # A shutter that stays open in the dark would leave no drop to resolve, and one colour.
+        sharp = replace(BATCH_OPTIONS, without=(*BATCH_OPTIONS.without, "exposure"))
+        render_batch(**arguments([case]), options=sharp)
     return caught["scene"]
 
 

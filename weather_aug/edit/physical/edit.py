@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,7 +28,10 @@ Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 
 TABLE_STEPS = 1024
-"""Of the tone of linear light, by its square root."""
+"""Of the tone of linear light up to 1, by its square root."""
+MOST_ROOT = 4
+"""The table ends at the square of this: a white surface in the sun is brighter than a picture's
+white, because the camera exposes for the whole street."""
 
 
 def edited(
@@ -61,11 +65,11 @@ def edited(
     out = np.empty((3, height, width), np.uint8)
     dress(
         surface_of(frame),
-        layers.classes.reshape(-1),
+        _flat(layers.classes),
         window,
         geometry_of(frame.camera, ambience.axes_world, layers.plane, labelled=labelled),
         look,
-        layers.tint,
+        _flat(layers.tint),
         curve.astype(np.float32),
         matrix.astype(np.float32),
         material_table(labelled=labelled),
@@ -93,13 +97,12 @@ def geometry_of(camera: Camera, axes_world: Float64, plane: Float64, *, labelled
 
 
 def maps_in(layers: Layers, window: Window, look: Look, curve: Float64, matrix: Float64) -> Float32:
-    """The kernel's maps (14, h, w): the layers under the weather's light, where a window is."""
+    """The kernel's maps (18, h, w): the layers under the weather's light, where a window is."""
     top, _, height, _ = window
     rows = layers.maps.shape[1]
     first = max(int(top / layers.step) - 1, 0)
     last = min(int((top + height) / layers.step) + 2, rows)
-    root = np.linspace(0.0, 1.0, TABLE_STEPS)
-    table = np.interp(root**2, SRGB_LEVELS_LINEAR, curve).astype(np.float32)
+    table = _tone_table(curve)
     horizon = np.array([look.red, look.green, look.blue])
     out = np.zeros((MAPS, *layers.maps.shape[1:]), np.float32)
     _under_tone(
@@ -112,6 +115,22 @@ def maps_in(layers: Layers, window: Window, look: Look, curve: Float64, matrix: 
         out,
     )
     return out
+
+
+def _flat(array: NDArray[Any]) -> Any:
+    """A read-only (N,) view, so that the kernel is compiled once for what may be written or not."""
+    flat = np.ascontiguousarray(array).reshape(-1).view(np.ndarray)
+    flat.flags.writeable = False
+    return flat
+
+
+def _tone_table(curve: Float64) -> Float32:
+    """Toned light (N,) by the square root of light, `TABLE_STEPS` a unit, from 0 to `MOST_ROOT`."""
+    light = np.linspace(0.0, MOST_ROOT, MOST_ROOT * TABLE_STEPS + 1) ** 2
+    # The tone is a power of light, so that its last two levels say how it goes on.
+    power = np.log(curve[-1] / curve[-2]) / np.log(SRGB_LEVELS_LINEAR[-1] / SRGB_LEVELS_LINEAR[-2])
+    inside = np.interp(light, SRGB_LEVELS_LINEAR, curve)
+    return np.where(light > 1.0, curve[-1] * light**power, inside).astype(np.float32)
 
 
 @compiled
@@ -143,9 +162,9 @@ def _under_tone(maps, table, matrix, sky, mirrors, first, out):
 
 @compiled
 def _toned(light, table):
-    last = np.float32(TABLE_STEPS - 1)
-    root = np.sqrt(max(light, np.float32(0.0))) * last
+    last = np.float32(MOST_ROOT * TABLE_STEPS)
+    root = np.sqrt(max(light, np.float32(0.0))) * np.float32(TABLE_STEPS)
     if root >= last:
-        return table[TABLE_STEPS - 1]
+        return table[MOST_ROOT * TABLE_STEPS]
     step = np.int32(root)
     return table[step] + (root - np.float32(step)) * (table[step + 1] - table[step])

@@ -92,17 +92,21 @@ class Site:
         return self.axes_world @ self.frame.camera.centre_world
 
     @cached_property
-    def points(self) -> Float32:
-        """(h, w, 3) places of the surfaces in street axes; not finite in the sky."""
+    def offsets_m(self) -> Float32:
+        """(h, w, 3) from the camera to the surfaces in street axes; not finite in the sky.
+
+        Not from the world's origin: in a map's coordinates float32 is good to half a metre.
+        """
         with np.errstate(invalid="ignore"):
-            return (self.origin + self.depth_m[..., None] * self.rays).astype(np.float32)
+            return self.depth_m[..., None] * self.rays
 
     @cached_property
     def height_m(self) -> Float32:
         """(h, w) of the surfaces over the road's plane; `inf` in the sky."""
+        above = self.origin[2] - self.plane[0] - self.plane[1:] @ self.origin[:2]
         with np.errstate(invalid="ignore"):
-            along, left, up = np.moveaxis(self.points, -1, 0)
-            height = up - (self.plane[0] + self.plane[1] * along + self.plane[2] * left)
+            along, left, up = np.moveaxis(self.offsets_m, -1, 0)
+            height = above + up - self.plane[1] * along - self.plane[2] * left
         return np.where(np.isfinite(self.depth_m), height, np.inf).astype(np.float32)
 
     @cached_property

@@ -6,14 +6,16 @@ Its colours are anchored to the world, so that two cameras see the same street.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 
 from weather_aug.clip.types import Camera, Frame, FrameKey
+from weather_aug.colour import SRGB_LEVELS_LINEAR
 from weather_aug.edit.ambience import Ambience
-from weather_aug.edit.physical.edit import edited
+from weather_aug.edit.physical.edit import edited, geometry_of
 from weather_aug.edit.physical.layers import NAMES, Layers, layers_of
+from weather_aug.edit.physical.materials import MATERIALS, material_table
 from weather_aug.edit.physical.site import site_of
 from weather_aug.taxonomy import ROAD, SIDEWALK, SKY, TERRAIN, TRAIN_ID
 from weather_aug.weather import Weather
@@ -50,6 +52,18 @@ AMBIENCE = Ambience(
     airlight=np.array([0.55, 0.56, 0.57]),
     camera_height_m=CAMERA_HEIGHT_M,
 )
+EFFECTS = ("relight", "sky", "film", "mirror", "puddles", "snow_cover", "tracks")
+DEEP = Weather(snow_cover=1.0, road_snow_cover=1.0, snow_depth_m=0.2)
+ALL = Weather(
+    rain_mm_per_h=10.0,
+    wetness=0.8,
+    puddles=0.3,
+    snow_cover=0.5,
+    road_snow_cover=0.4,
+    snow_depth_m=0.05,
+    overcast=0.7,
+)
+"""Some of everything."""
 WEATHERS = {
     "overcast": Weather(overcast=0.8),
     "wet": Weather(wetness=0.9, overcast=0.6, rain_mm_per_h=8.0),
@@ -202,3 +216,42 @@ def _picture(label, points):
 def _shared(array):
     array.flags.writeable = False
     return array
+
+
+@cache
+def street(**view):
+    """One of each kind, so that it is drawn once."""
+    return Street(**view)
+
+
+def light(image):
+    """Linear light of sRGB levels."""
+    return SRGB_LEVELS_LINEAR[image]
+
+
+def off(one, other):
+    """(H, W) greatest difference of a channel, levels."""
+    return np.abs(one.astype(int) - other).max(-1)
+
+
+def with_material(name, **changes):
+    """A table of materials with a fault in one class."""
+
+    def wrong(*, labelled):
+        table = material_table(labelled=labelled).copy()
+        for field, value in changes.items():
+            table[TRAIN_ID[name], MATERIALS[name]._fields.index(field)] = value
+        table.flags.writeable = False
+        return table
+
+    return wrong
+
+
+def with_geometry(**changes):
+    """A camera's geometry with a fault."""
+
+    def wrong(*args, **kwargs):
+        found = geometry_of(*args, **kwargs)
+        return found._replace(**{k: np.float32(f(getattr(found, k))) for k, f in changes.items()})
+
+    return wrong

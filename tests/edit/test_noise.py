@@ -3,6 +3,8 @@
 Each check takes a function (along, left, size) -> noise in [0, 1]; the faults are other functions.
 """
 
+from itertools import pairwise
+
 import numba
 import numpy as np
 import pytest
@@ -153,7 +155,7 @@ def test_copies_keep_the_mean():
 
 def test_each_copy_is_the_mean_of_the_one_before():
     copies = reference.levels()
-    for fine, coarse in zip(copies, copies[1:], strict=False):
+    for fine, coarse in pairwise(copies):
         four = fine.reshape(len(coarse), 2, len(coarse), 2).mean(axis=(1, 3))
         assert np.abs(four - coarse).max() <= 1.0
 

@@ -1,6 +1,7 @@
 """Where snow can settle and where wheels run, against places that are known."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -130,10 +131,14 @@ def test_the_distance_is_that_of_the_nearest_point_of_the_way(corners):
     if not (np.hypot(*np.diff(path, axis=0).T) > 0.5).all():
         return
     places = np.stack(np.meshgrid(np.linspace(-30, 30, 9), np.linspace(-30, 30, 9)), -1)
-    ends = [path[:1] + 200 * _unit(path[0] - path[1]), path, path[-1:] + 200 * _unit(path[-1] - path[-2])]
+    ends = [
+        path[:1] + 200 * _unit(path[0] - path[1]),
+        path,
+        path[-1:] + 200 * _unit(path[-1] - path[-2]),
+    ]
     nodes = np.concatenate(ends)
     dense = np.concatenate(
-        [a + np.linspace(0, 1, 1500)[:, None] * (b - a) for a, b in zip(nodes, nodes[1:], strict=False)]
+        [a + np.linspace(0, 1, 1500)[:, None] * (b - a) for a, b in pairwise(nodes)]
     )
     brute = np.hypot(*(places[..., None, :] - dense).transpose(3, 0, 1, 2)).min(-1)
     found = np.abs(settling._signed_distance(places, path))

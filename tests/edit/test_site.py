@@ -1,4 +1,4 @@
-"""Where the editor thinks surfaces are and what they are, against a street whose places are known."""
+"""Where the editor thinks surfaces are and what they are, against a street that is known."""
 
 from dataclasses import replace
 

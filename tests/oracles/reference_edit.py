@@ -203,9 +203,7 @@ def edited(frame, layers, weather, ambience, without=()):
     lines = at("ground_slope") * luma + at("ground_offset")
     lines = np.minimum(np.maximum(lines, at("ground_least")), at("ground_most")) * strength
     tinted = lines[..., None] + np.maximum(lines, 0)[..., None] * layers.tint
-    standing = np.clip(
-        at("object_slope") * luma + at("object_offset"), np.log(0.75), np.log(2.5)
-    )
+    standing = np.clip(at("object_slope") * luma + at("object_offset"), np.log(0.75), np.log(2.5))
     exponent = np.where(ground[..., None], tinted, strength * standing[..., None])
     light = light * np.exp(exponent) * gain @ matrix.T
     view = view_of(frame, ambience, layers.plane)

@@ -2,7 +2,7 @@
 
 Each check is a function `check_*` that a test runs once on the package (it passes) and once on each
 planted fault (it fails; tests named `..._found_out`). The numbers are those of the
-table of promises in docs/physics.md; 14 is kept for the wet road, 15 is in the labels' own tests.
+table of promises in docs/physics.md; 15 is in the labels' own tests.
 
 no  what                         check (file test_sanity_..., function)       planted faults
 1   Beer and Lambert, scatter    extinction.check_beer_lambert                paper's opacities
@@ -35,6 +35,10 @@ no  what                         check (file test_sanity_..., function)       pl
 13  ... height fog               fog.check_height_fog                         even, surface, depth
 13  ... its kernel               fog.check_kernel                             depth for range
 13  ... sky                      fog.check_sky                                box of 80 m
+14  Fresnel                      surfaces.check_fresnel                       Schlick
+14  ... film                     surfaces.check_film                          fixed darkening
+14  ... diffuse                  surfaces.check_diffuse                       dry film
+14  ... mirror                   surfaces.check_mirror                        normals, even share
 16  sky rule                     severity.check_sky                           greys, dilation
 """
 
@@ -49,7 +53,7 @@ HERE = Path(__file__).parent
 
 
 def test_every_number_has_a_row():
-    assert {int(number) for number, _, _ in ROWS} == {*range(1, 14), 16}
+    assert {int(number) for number, _, _ in ROWS} == {*range(1, 15), 16}
 
 
 @pytest.mark.parametrize(("number", "file", "name"), ROWS)

@@ -13,6 +13,7 @@ import numpy as np
 from weather_aug.clip.types import Camera, Frame, FrameKey
 from weather_aug.colour import SRGB_LEVELS_LINEAR
 from weather_aug.edit.ambience import Ambience
+from weather_aug.edit.physical.dress import dress
 from weather_aug.edit.physical.edit import edited, geometry_of
 from weather_aug.edit.physical.layers import NAMES, Layers, layers_of
 from weather_aug.edit.physical.materials import MATERIALS, material_table
@@ -52,7 +53,7 @@ AMBIENCE = Ambience(
     airlight=np.array([0.55, 0.56, 0.57]),
     camera_height_m=CAMERA_HEIGHT_M,
 )
-EFFECTS = ("relight", "sky", "film", "mirror", "puddles", "snow_cover", "tracks")
+EFFECTS = ("relight", "sky", "film", "mirror", "puddles", "ripples", "snow_cover", "tracks")
 DEEP = Weather(snow_cover=1.0, road_snow_cover=1.0, snow_depth_m=0.2)
 ALL = Weather(
     rain_mm_per_h=10.0,
@@ -253,5 +254,19 @@ def with_geometry(**changes):
     def wrong(*args, **kwargs):
         found = geometry_of(*args, **kwargs)
         return found._replace(**{k: np.float32(f(getattr(found, k))) for k, f in changes.items()})
+
+    return wrong
+
+
+def with_layers(name, change):
+    """The kernel with a fault in one layer, a function of (h, w) float16 and the window."""
+
+    def wrong(planes, surface, classes, window, *others):
+        *between, layers, step, tile, out = others
+        maps = layers.view(np.float16).copy()
+        maps[NAMES.index(name)] = change(maps[NAMES.index(name)], window, step)
+        bits = maps.view(np.uint16)
+        bits.flags.writeable = False
+        dress(planes, surface, classes, window, *between, bits, step, tile, out)
 
     return wrong

@@ -16,6 +16,7 @@ from edit_scene import (
     plain_layers,
     street,
     with_geometry,
+    with_layers,
     with_material,
 )
 from hypothesis import given, settings
@@ -60,6 +61,7 @@ def _with_look(**changes):
     return wrong
 
 
+TONE_TABLES = module._tone_tables
 FAULTS = {
     "more of the road flooded": ("wet", "look_of", _with_look(flooded=lambda v: v + 0.1)),
     "half the film": ("wet", "look_of", _with_look(film=lambda v: 0.8 * v)),
@@ -74,7 +76,7 @@ FAULTS = {
     "dry pavements": ("wet", "material_table", with_material("sidewalk", mirror=0.0)),
     "a metre aside": ("heavy snow", "geometry_of", with_geometry(left_0=lambda v: v + 1)),
     "half a pixel up": ("puddles", "geometry_of", with_geometry(cy=lambda v: v + 2)),
-    "no white balance": ("overcast", "tone", lambda o: (module.SRGB_LEVELS_LINEAR, np.eye(3))),
+    "no tone": ("overcast", "_tone_tables", lambda overcast: TONE_TABLES(0.0)),
 }
 
 
@@ -129,14 +131,12 @@ def test_single_pixels_are_the_same():
 
 
 def test_maps_cut_too_narrow_are_found(monkeypatch):
-    right = module.maps_in
+    def narrow(layer, window, step):
+        cut = layer.copy()
+        cut[: int(window[0] / step) + 1] = 0.0
+        return cut
 
-    def narrow(layers, window, *args):
-        out = right(layers, window, *args)
-        out[:, : int(window[0] / layers.step) + 1] = 0.0
-        return out
-
-    monkeypatch.setattr(module, "maps_in", narrow)
+    monkeypatch.setattr(module, "dress", with_layers("illumination", narrow))
     with pytest.raises(AssertionError):
         check_window(street(**COARSE), ALL, (21, 5, 9, 100))
 
@@ -189,10 +189,15 @@ def test_half_precision_depth_is_the_same_picture(name):
 CHANGED = {
     "mirror": ("road", "sidewalk"),
     "puddles": ("road",),
+    "ripples": ("road", "sidewalk"),
     "tracks": ("road",),
 }
 """Where alone leaving an effect out may change anything."""
 EVERYWHERE = ("relight", "sky", "film", "snow_cover")
+
+
+NEAR = {"pitch_deg": -45.0, "focal_px": 200.0, "boxes": ()}
+"""So near that the rings of drops are seen."""
 
 
 def check_left_out(here, effect):
@@ -205,20 +210,20 @@ def check_left_out(here, effect):
 
 @pytest.mark.parametrize("effect", (*CHANGED, *EVERYWHERE))
 def test_each_effect_can_be_left_out(effect):
-    check_left_out(street(), effect)
+    check_left_out(street(**NEAR) if effect == "ripples" else street(), effect)
 
 
 def test_a_name_that_is_not_heard_is_found(monkeypatch):
-    monkeypatch.setattr(module, "look_of", lambda *args: look_of(*args[:3], ()))
+    monkeypatch.setattr(module, "look_of", lambda *args: look_of(*args[:4], ()))
     for effect in CHANGED:
         with pytest.raises(AssertionError):
-            check_left_out(street(), effect)
+            check_left_out(street(**NEAR) if effect == "ripples" else street(), effect)
 
 
 def test_an_effect_that_reaches_too_far_is_found(monkeypatch):
-    def far(weather, ambience, illumination, without):
-        found = look_of(weather, ambience, illumination, without)
-        return found._replace(exposure=np.float32(1.1)) if "mirror" in without else found
+    def far(*args):
+        found = look_of(*args)
+        return found._replace(exposure=np.float32(1.1)) if "mirror" in args[-1] else found
 
     monkeypatch.setattr(module, "look_of", far)
     with pytest.raises(AssertionError):
@@ -261,8 +266,7 @@ def test_every_level_of_every_channel_comes_back():
 
 
 def test_a_tone_left_on_is_found(monkeypatch):
-    right = module.tone
-    monkeypatch.setattr(module, "tone", lambda overcast: right(max(overcast, 0.1)))
+    monkeypatch.setattr(module, "_tone_tables", lambda overcast: TONE_TABLES(max(overcast, 0.1)))
     with pytest.raises(AssertionError):
         check_identity(street(), Weather())
 
@@ -276,14 +280,14 @@ STATES = (
 
 
 def check_continuous(here, base, name, step=1e-3):
-    """A thousandth more is less than a tenth of a level on the mean, and no jump but of a few.
+    """A thousandth more is less than a fifth of a level on the mean, and no jump but of a few.
 
     The few are pixels at the foot of walls, that snow buries when it gets deeper.
     """
     value = getattr(base, name)
     near = replace(base, **{name: value + (step if value < 0.5 or name[:4] == "rain" else -step)})
     difference = off(here.edited(base), here.edited(near))
-    assert difference.mean() < 0.1
+    assert difference.mean() < 0.2
     assert (difference > 3).mean() < 5e-4
 
 

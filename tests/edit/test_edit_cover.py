@@ -13,6 +13,7 @@ from edit_scene import (
     plain_layers,
     points_of,
     street,
+    with_layers,
     with_material,
 )
 from oracles import reference_edit as reference
@@ -22,7 +23,6 @@ from weather_aug.edit.physical import edit as module
 from weather_aug.edit.physical import look as look_module
 from weather_aug.edit.physical.edit import edited
 from weather_aug.edit.physical.ground_rows import covered
-from weather_aug.edit.physical.layers import LATERAL_M
 from weather_aug.edit.physical.materials import MATERIALS
 from weather_aug.edit.physical.noise import PERIOD_M
 from weather_aug.taxonomy import IGNORE, ROAD, SKY, TERRAIN, TRAIN_ID
@@ -140,7 +140,7 @@ def tracks_of(cover, middle):
         place, here = np.array(
             [(x - middle, v) for x, v in cover.items() if low <= x - middle <= high]
         ).T
-        found.append((np.average(place, weights=np.maximum(whole - here, 0.0)), here.min()))
+        found.append((np.average(place, weights=np.maximum(whole - here, 1e-6)), here.min()))
     return found
 
 
@@ -168,14 +168,8 @@ def test_a_road_without_tracks_is_found():
 
 
 def test_tracks_of_another_gauge_are_found(monkeypatch):
-    right = module.maps_in
-
-    def wider(*args):
-        out = right(*args)
-        out[LATERAL_M] *= np.float32(0.7)
-        return out
-
-    monkeypatch.setattr(module, "maps_in", wider)
+    wider = with_layers("lateral_m", lambda layer, *_: layer * np.float16(0.7))
+    monkeypatch.setattr(module, "dress", wider)
     with pytest.raises(AssertionError):
         check_tracks()
 
@@ -300,10 +294,6 @@ def test_it_does_so_where_the_exposure_is_kept(monkeypatch, illumination):
 def test_light_cut_at_the_pictures_white_is_found(monkeypatch):
     """A white surface in the sun is brighter than a picture can be."""
     monkeypatch.setattr(look_module, "WET_EXPOSURE", 0.0)
-    right = module.maps_in
-
-    def cut(*args):
-        return np.minimum(right(*args), np.float32(1.0))
-
-    monkeypatch.setattr(module, "maps_in", cut)
+    cut = with_layers("illumination", lambda layer, *_: np.minimum(layer, np.float16(1.0)))
+    monkeypatch.setattr(module, "dress", cut)
     assert abs(film_error(3.0)) > 0.01

@@ -7,7 +7,7 @@ import pytest
 from edit_scene import CAMERA_HEIGHT_M, Street, flat_street
 
 from weather_aug.colour import linear_from_srgb
-from weather_aug.edit.physical import dress, layers, smear
+from weather_aug.edit.physical import layers, smear
 from weather_aug.edit.physical.layers import NAMES, layers_of
 from weather_aug.edit.physical.mirror_lines import View
 from weather_aug.edit.physical.relight import DARK
@@ -37,8 +37,6 @@ def by_name(found):
 
 def test_names_are_where_the_kernels_look():
     assert {name: NAMES[getattr(layers, name)] for name in PLACES} == PLACES
-    for name, place in (("LIGHT", "ILLUMINATION"), ("GROUND_GAIN",) * 2, ("SHARP",) * 2):
-        assert getattr(dress, name) == getattr(layers, place)
 
 
 @pytest.mark.parametrize("labelled", [True, False])

@@ -14,7 +14,7 @@ from weather_aug.edit.physical.look import EXPOSURE_RANGE, Look, changes_backgro
 from weather_aug.weather import Weather
 
 ALL = Weather(
-    rain_mm_per_h=20.0,
+    rain_mm_per_h=5.0,
     wetness=0.8,
     puddles=0.2,
     snow_cover=0.6,
@@ -28,6 +28,7 @@ SHOWS = {
     "film": {"film", "exposure"},
     "mirror": {"mirror"},
     "puddles": {"puddles"},
+    "ripples": {"ripples"},
     "snow_cover": {"snow", "road_snow", "snow_depth_m", "exposure"},
     "tracks": {"tracks"},
 }
@@ -46,7 +47,7 @@ weathers = st.builds(
 
 
 def look(weather, without=(), illumination=0.3):
-    return look_of(weather, AMBIENCE, illumination, without)
+    return look_of(weather, AMBIENCE, illumination, 1.0, without)
 
 
 def changed(one, other):

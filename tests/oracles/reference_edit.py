@@ -2,7 +2,8 @@
 
 Written from the physics and from what the kernels promise; it shares with them the numbers of the
 noise tile, which are random, the layers of a frame, the table of materials and the named constants
-of taste (how a camera exposes, how bright slush is), so that only arithmetic is compared.
+of taste (how a camera exposes, how bright slush is), so that only arithmetic is compared. The rings
+of drops are not in it.
 """
 
 from collections import namedtuple
@@ -10,8 +11,8 @@ from collections import namedtuple
 import numpy as np
 from oracles.reference_render import linear, srgb
 
+from weather_aug.edit.physical import ground_rows as taste
 from weather_aug.edit.physical import look
-from weather_aug.edit.physical.ground_rows import CLEAN, SLUSH
 from weather_aug.edit.physical.layers import NAMES
 from weather_aug.edit.physical.materials import MATERIALS
 from weather_aug.edit.physical.noise import noise_tile
@@ -134,6 +135,24 @@ def noise(along, left, size_m, offset_m=0.0):
     return evenly(total)
 
 
+def noise_of_row(view, ground, camera, offset_m):
+    """(H, W) noise of the pixels' places: of every fourth column, and straight between those.
+
+    On what stands it is that of the ground along a slope, of four pixels; far away it is 1/2.
+    """
+    width = view.depth.shape[1]
+    columns = np.minimum(np.arange(0, width + 4, 4), width - 1)
+    knots = View(*(part[:, columns] for part in view))
+    on_ground = ground[:, columns]
+    slope = np.where(on_ground, 0.0, 0.6 * knots.height)
+    oblique = 4 * np.minimum(knots.depth, 1e4) / camera.focal_px[1]
+    size = np.where(on_ground, knots.size_m, oblique)
+    value = noise(knots.along + slope, knots.left + slope, size, offset_m)
+    value = np.where(knots.depth < 2000.0, value, 0.5)
+    first, part = np.arange(width) // 4, np.arange(width) % 4 / 4
+    return value[:, first] + part * (value[:, first + 1] - value[:, first])
+
+
 def smooth(low, high, value):
     with np.errstate(invalid="ignore", divide="ignore"):
         t = np.clip(np.nan_to_num((value - low) / (high - low)), 0, 1)
@@ -148,11 +167,11 @@ def cover(amount, fuzz, value):
 
 def wheel_tracks(lateral_m, value):
     """How far in a wheel's track: two a lane, fewer drive on the lanes beside."""
-    side = lateral_m + 0.5 * (value - 0.5)
+    side = lateral_m + taste.WANDER_M * (value - 0.5)
     lane = np.floor(side / 3.5 + 0.5)
     off = np.abs(np.abs(side - 3.5 * lane) - 0.75)
     driven = np.maximum(1 - 0.45 * np.abs(lane), 0)
-    return driven * (1 - smooth(0.14, 0.42, off))
+    return driven * (1 - smooth(0.3 * taste.TRACK_M, 1.7 * taste.TRACK_M, off))
 
 
 def film_ratio(albedo):
@@ -231,13 +250,14 @@ def edited(frame, layers, weather, ambience, without=()):
         shown = curve(np.maximum(shown, 0) / np.maximum(left, 0.01)[..., None]) * gain @ matrix.T
         mixed = left[..., None] * shown + sky[..., None] * ambience.airlight
         mirror[kind] = np.stack([spread(mixed[..., c], layers.step, shape) for c in range(3)], -1)
-    value = noise(view.along, view.left, view.size_m)
+    # Wheel tracks wander where snow is drawn only.
+    snowy = snow > 0 or road_snow > 0
+    value = noise_of_row(view, ground, frame.camera, 0.0) if snowy else np.full(shape, 0.5)
     tracks = wheel_tracks(at("lateral_m"), value) if has("tracks") else np.zeros(shape)
     fuzz = np.minimum(0.07 + 0.25 * view.size_m, 0.5)
     edges = below_top(view.depth, kinds, frame.camera.focal_px[1])
-    slope = 0.6 * view.height
-    oblique = np.minimum(view.depth, 1e4) / frame.camera.focal_px[1]
-    on_walls = noise(view.along + slope, view.left + slope, oblique)
+    oblique = np.minimum(view.depth / frame.camera.focal_px[1], 1.0)
+    on_walls = value
     done = light.copy()
     for name, material in MATERIALS.items():
         here = kinds == TRAIN_ID[name]
@@ -252,15 +272,17 @@ def edited(frame, layers, weather, ambience, without=()):
         if is_ground and shine * material.mirror > 0:
             rut = tracks if is_road else np.zeros(shape)
             pools = weather.puddles if is_road and has("puddles") else 0.0
-            lie = noise(view.along, view.left, view.size_m, 11.3)
-            pool = cover(pools * (1 + 1.5 * rut), fuzz, lie) if pools else np.zeros(shape)
+            lie = noise_of_row(view, ground, frame.camera, 11.3)
+            pool = (
+                cover(pools * (1 + taste.RUT_WATER * rut), fuzz, lie) if pools else np.zeros(shape)
+            )
             water = shine * material.mirror * np.ones(shape)
             if not labelled:
                 water = water * (1 - smooth(0.05, 0.20, view.height))
             flooded = flooded_film + pool * (1 - flooded_film)
             stones = water * (1 - flooded) * 0.5 * fresnel(np.sqrt(view.sine**2 + 0.25**2))
             calm = water * flooded * fresnel(view.sine)
-            kept = (1 - stones - calm) * (1 - 0.2 * pool)
+            kept = (1 - stones - calm) * (1 - taste.POOL_DARKENING * pool)
             sharp = mirror["rough"] + pool[..., None] * (mirror["sharp"] - mirror["rough"])
             now = kept[..., None] * now + stones[..., None] * mirror["rough"]
             now = now + calm[..., None] * sharp
@@ -268,10 +290,11 @@ def edited(frame, layers, weather, ambience, without=()):
             amount = road_snow if is_road else snow * material.cover
             if amount > 0:
                 rut = tracks if is_road else np.zeros(shape)
-                share = cover(amount * (1 - 0.85 * rut), fuzz, value)
+                softer = taste.TRACK_SOFTNESS if is_road else 0.0
+                share = cover(amount * (1 - (1 - taste.TRACK_COVER) * rut), fuzz + softer, value)
                 under = np.minimum(now @ WEIGHTS / (0.12 * lit), 2.0)
-                least = SLUSH if is_road else CLEAN
-                shade = (least + (1.02 - least) * value) * (0.95 + 0.05 * under)
+                least = taste.SLUSH if is_road else taste.CLEAN
+                shade = (least + (1.02 - least) * value) * (1 - taste.SHOWING_THROUGH * (1 - under))
                 now = laid(now, share, bright * shade)
         elif snow * material.cover > 0 and (material.cap_m > 0 or material.leaf > 0):
             lies = bright * (0.81 + 0.11 * on_walls)
@@ -280,7 +303,7 @@ def edited(frame, layers, weather, ambience, without=()):
                 usual = np.maximum(mean, 0.002)
                 detail = np.clip(0.5 + 0.7 * (now @ WEIGHTS / (usual * gain) - 1), 0, 1)
                 share = cover(0.8 * amount, 0.2, 0.25 * on_walls + 0.75 * detail)
-                lies = lies * np.minimum(0.25 + 4 * usual / np.maximum(lit, 0.02), 0.85)
+                lies = lies * np.minimum(0.25 + 4 * mean / np.maximum(lit, 0.02), 0.85)
             else:
                 uneven = 0.6 + 0.8 * on_walls
                 edge = material.cap_m * snow * uneven + 0.4 * deep_m
@@ -293,7 +316,7 @@ def edited(frame, layers, weather, ambience, without=()):
             share = np.where(
                 buried & (view.depth < 30.0), np.maximum(share, snow * material.buried), share
             )
-            now = laid(now, np.where(np.isfinite(view.depth), share, 0.0), lies)
+            now = laid(now, share, lies)
         done = np.where(here[..., None], now, done)
     if has("sky") and weather.overcast > 0:
         feature = image @ np.array([-0.5, 0.0, 1.5])

@@ -2,7 +2,7 @@
 
 Each check is a function `check_*` that a test runs once on the package (it passes) and once on each
 planted fault (it fails; tests named `..._found_out`). The numbers are those of the
-table of promises in docs/physics.md; 15 is in the labels' own tests.
+table of promises in docs/physics.md.
 
 no  what                         check (file test_sanity_..., function)       planted faults
 1   Beer and Lambert, scatter    extinction.check_beer_lambert                paper's opacities
@@ -39,6 +39,10 @@ no  what                         check (file test_sanity_..., function)       pl
 14  ... film                     surfaces.check_film                          fixed darkening
 14  ... diffuse                  surfaces.check_diffuse                       dry film
 14  ... mirror                   surfaces.check_mirror                        normals, even share
+15  labels' ids                  labels.check_ids                             colours, mixed, snow
+15  ... and classes              labels.check_never_from_the_picture          colours, snow
+15  ... ignored grows            labels.check_ignored_grows                   re-roll, turns back
+15  ... but not in moderate fog  labels.check_moderate_fog_hides_little       half hidden
 16  sky rule                     severity.check_sky                           greys, dilation
 """
 
@@ -53,7 +57,7 @@ HERE = Path(__file__).parent
 
 
 def test_every_number_has_a_row():
-    assert {int(number) for number, _, _ in ROWS} == {*range(1, 15), 16}
+    assert {int(number) for number, _, _ in ROWS} == {*range(1, 17)}
 
 
 @pytest.mark.parametrize(("number", "file", "name"), ROWS)

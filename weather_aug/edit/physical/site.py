@@ -26,7 +26,7 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 
-CELLS_ACROSS = 448
+CELLS_ACROSS = 320
 """At most so many cells of the small grid lie side by side."""
 PLANE_RANGE_M = (3.0, 40.0)
 PLANE_SIDE_M = 8.0
@@ -240,7 +240,7 @@ def _classes(frame: Frame, axes_world: Float64, plane: Float64) -> UInt8:
         np.array(numbers, np.float32),
         out,
     )
-    return cv2.medianBlur(out, SPECKLE_PX)
+    return cv2.medianBlur(cv2.medianBlur(out, SPECKLE_PX), SPECKLE_PX)
 
 
 def _without_gaps(label: UInt8) -> UInt8:

@@ -7,7 +7,7 @@ every weather of it is a function of them, pixel by pixel.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -39,6 +39,7 @@ GROUND_GAIN, OBJECT_GAIN, MATTE = 0, 4, 6
 ILLUMINATION, LUMINANCE_MEAN, FACING_UP, LATERAL_M = range(8, 12)
 SHARP, ROUGH = 12, 16
 MEAN_CELLS = 9
+THUMBNAIL_WIDTH_PX = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +55,10 @@ class Layers:
     """(3,) of the road: up = plane[0] + plane[1] along + plane[2] left, street axes."""
     classes: UInt8
     """(H, W) train ids, guessed where nobody labelled."""
-
-    @cached_property
-    def illumination(self) -> float:
-        """Luminance of a white surface in the recorded street, linear light."""
-        return float(np.median(self.maps[ILLUMINATION]))
+    illumination: float
+    """Luminance of a white surface in the recorded street, linear light."""
+    thumbnail: UInt8
+    """(h', w', 3) sRGB, the picture at most 256 pixels wide: what glass and glare see of it."""
 
 
 def layers_of(site: Site, path: Float64 | None = None) -> Layers:
@@ -91,8 +91,34 @@ def layers_of(site: Site, path: Float64 | None = None) -> Layers:
         free.rough[..., 0],
     )
     stack = halves(np.stack(planes))
-    stack.flags.writeable = False
-    return Layers(float(site.step), stack, flat.tint, site.plane, site.classes)
+    return Layers(
+        float(site.step),
+        _shared(stack),
+        _shared(flat.tint),
+        _shared(site.plane),
+        _shared(site.classes),
+        float(np.median(stack[ILLUMINATION])),
+        _shared(thumbnail_of(site.frame.image)),
+    )
+
+
+def thumbnail_shape(height: int, width: int) -> tuple[int, int]:
+    """(h', w') of the thumbnail of a picture, pixels."""
+    small_width = min(THUMBNAIL_WIDTH_PX, width)
+    return max(1, round(height * small_width / width)), small_width
+
+
+def thumbnail_of(image: UInt8) -> UInt8:
+    """The picture (H, W, 3) at most 256 pixels wide, by means of its pixels."""
+    height, width = thumbnail_shape(*image.shape[:2])
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
+
+
+def _shared(array: NDArray[Any]) -> Any:
+    """A view that nobody can write: layers are shared, and kernels are compiled for such arrays."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def overcast_light(site: Site, flat: relight.Flattening) -> Float32:

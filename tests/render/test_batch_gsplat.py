@@ -101,9 +101,12 @@ def test_bounds_hold_the_surfaces_under_a_footprint(scene):
 
 def test_slabs_agree_with_exact_order(scene):
     splats, depth = scene
+    # Each slab's large splats are drawn behind its others; without any there is no approximation.
+    splats = replace(splats, large=splats.half.amax(dim=1) > 3)
     exact = splat(splats, depth)
     assert exact.through.min() < 0.7
     light, through = difference(splat_in_slabs(splats, depth, torch_twin, 4), exact)
+    assert light > 1e-7
     assert light < 1e-3
     assert through < 1e-5
     one, _ = difference(splat_in_slabs(splats, depth, torch_twin, 1), exact)

@@ -19,7 +19,7 @@ from weather_aug._compiled import compiled
 from weather_aug.clip.types import Camera
 from weather_aug.edit.ambience import Ambience
 from weather_aug.edit.physical.dress import MAPS, OBJECT_GAINS
-from weather_aug.edit.physical.edit import _tone_tables, geometry_of
+from weather_aug.edit.physical.edit import _shared, _tone_tables, geometry_of
 from weather_aug.edit.physical.layer_rows import load_row
 from weather_aug.edit.physical.layers import GROUND_GAIN, MATTE, OBJECT_GAIN, Layers
 from weather_aug.edit.physical.look import look_of
@@ -92,8 +92,8 @@ class Dressing:
         look = look_of(weather, ambience, layers.illumination, time_s, without)
         curve, by_root, matrix = _tone_tables(0.0 if "relight" in without else weather.overcast)
         maps = np.zeros((MAPS, *layers.maps.shape[1:]), np.float32)
-        _under_tone(layers.maps.view(np.uint16), by_root, matrix, look, maps)
-        classes = torch.tensor(layers.classes, device=depth_m.device)
+        _under_tone(_shared(layers.maps.view(np.uint16)), by_root, matrix, look, maps)
+        classes = torch.tensor(np.asarray(layers.classes), device=depth_m.device)
         geometry = geometry_of(camera, ambience.axes_world, layers.plane, labelled=labelled)
         tops = below_top_m(classes, depth_m, float(geometry.fy)) if look.snow > 0 else None
         return cls(

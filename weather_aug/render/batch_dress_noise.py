@@ -73,7 +73,7 @@ def ground_noise(along_m: Tensor, left_m: Tensor, footprint_m: Tensor, offset_m:
         along_m: (N,) metres along the street.
         left_m: (N,) metres to its left.
         footprint_m: (N,) size of the pixel on the ground: what is smaller is averaged.
-        offset_m: Metres.
+        offset_m: Metres at the fine look; at the coarse one it is as many cells.
 
     Returns:
         (N,), of the places' dtype and device.
@@ -85,9 +85,9 @@ def ground_noise(along_m: Tensor, left_m: Tensor, footprint_m: Tensor, offset_m:
     fine = _looked_up(tile, (along_m + offset_m) * per_m, (left_m - offset_m) * per_m, level)
     cosine, sine = _TURN
     u, v = cosine * along_m + sine * left_m, cosine * left_m - sine * along_m
-    slow = per_m / COARSER
+    slow, aside = per_m / COARSER, offset_m * per_m
     coarse_level = (level - COARSER_LEVELS).clamp(min=0)
-    coarse = _looked_up(tile, (u - offset_m) * slow, (v + offset_m) * slow, coarse_level)
+    coarse = _looked_up(tile, u * slow - aside, v * slow + aside, coarse_level)
     return evened(COARSE_SHARE * coarse + (1.0 - COARSE_SHARE) * fine)
 
 

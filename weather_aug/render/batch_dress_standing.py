@@ -16,6 +16,9 @@ from weather_aug.edit.physical.standing_rows import BURIED_RANGE_M, GRAIN_NOISE,
 from weather_aug.render.batch_dress_grid import Grid, Pixels
 from weather_aug.render.batch_dress_ground import covered, film, laid, luminance, ramp, snow_light
 
+ONE = 2.0**32
+"""Fixed point of depths over focal lengths: holds the sum of 30,000 rows of 60 km."""
+
 
 @torch.no_grad()
 def below_top_m(classes: Tensor, depth_m: Tensor, fy: float) -> Tensor:
@@ -34,11 +37,14 @@ def below_top_m(classes: Tensor, depth_m: Tensor, fy: float) -> Tensor:
     class_above = torch.nn.functional.pad(classes, (0, 0, 1, 0), value=255)[:-1]
     same = (classes == class_above) & ((depth - above).abs() < 1.5 + 0.2 * depth)
     fresh = torch.where(above > 1.05 * depth + 0.3, 0.0, NO_CAP_M).to(depth.dtype)
-    # The sum of steps down to here, less that down to where the run began.
-    sunk = torch.where(same, depth / fy, 0.0).cumsum(0)
+    # The sum of steps down to here, less that down to where the run began. In fixed point, because
+    # CUDA promises equal bits for running sums of integers only.
+    step = torch.where(same, depth / fy, 0.0)
+    sunk = (step * ONE).round().long().cumsum(0)
     row = torch.arange(len(depth), device=depth.device)[:, None]
     began = torch.where(same, 0, row).cummax(0).values
-    return (sunk + (fresh - sunk).gather(0, began)).to(depth_m.dtype)
+    below = (sunk - sunk.gather(0, began)).to(depth.dtype) / ONE + fresh.gather(0, began)
+    return below.to(depth_m.dtype)
 
 
 def holds_snow(material: Tensor) -> Tensor:

@@ -87,7 +87,7 @@ def smear(ends, twice, spread, view, slope, out):
         _on_columns(across, np.float32(row), view, out[row])
         lowest = row
     for row in range(lowest):
-        out[row] = out[min(lowest, height - 1)]
+        out[row] = out[lowest] if lowest < height else np.float32(0.0)
 
 
 @inlined

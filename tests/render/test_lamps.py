@@ -14,7 +14,7 @@ from weather_aug.edit.physical.vehicles import Vehicle
 from weather_aug.errors import ArgumentError
 from weather_aug.render import lamp_light, lamps
 from weather_aug.render.lamp_light import add_lamps
-from weather_aug.render.lamps import fresnel_water, lamps_of, seen_lamps
+from weather_aug.render.lamps import lamps_of, seen_lamps
 
 UP = np.array([0.0, 0.0, 1.0])
 WIDTH, HEIGHT = 320, 192
@@ -253,15 +253,6 @@ def test_a_head_lamp_is_a_small_white_disc():
 
 
 # The wet road
-
-
-def test_water_mirrors_as_the_table_says():
-    """docs/physics.md, exact for n = 1.333."""
-    table = {1: 0.90, 2: 0.80, 3: 0.72, 5: 0.58, 7: 0.47, 10: 0.35, 15: 0.21, 20: 0.13, 30: 0.06}
-    for degrees, share in table.items():
-        assert fresnel_water(math.radians(degrees)) == pytest.approx(share, abs=0.006)
-    assert fresnel_water(math.pi / 2) == pytest.approx(0.020, abs=5e-4)
-    assert fresnel_water(0.0) == pytest.approx(1.0)
 
 
 def test_a_streak_lies_below_the_lamp_on_wet_ground_only():

@@ -16,7 +16,7 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 AIRLIGHT_SATURATION = 0.1
-AIRLIGHT_SRGB = (0.60, 0.88)
+AIRLIGHT_SRGB = (0.78, 0.90)
 """Range of the airlight's luminance; a recorded sky may be night-blue or burnt out."""
 SAMPLES_PER_SIDE = 96
 CAMERA_HEIGHT_M = 1.5

@@ -25,6 +25,7 @@ from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.render.scattering import scattering_margin_px
 from weather_aug.render.stage import Planes, Stage
 from weather_aug.render.taken import camera_in, taken, window_taken
+from weather_aug.render.traffic import traffic_of
 from weather_aug.taxonomy import SKY
 from weather_aug.weather import Weather
 
@@ -126,8 +127,9 @@ def render(
     camera = camera_in(frame.camera, weather, options)
     stage = Stage(surface, outer, camera, weather, ambience, seed, air, options)
     fields = fields_of(weather, seed, air, ambience.axes_world, options, rig)
-    shot = stage.shaded(fields, shelter, frame.time_s)
-    photo = taken(shot.image, frame, stage, fields, layers)
+    traffic = traffic_of(frame, weather, ambience, seed, options)
+    shot = stage.shaded(fields, shelter, frame.time_s, traffic.spray(air))
+    photo = taken(traffic.lit(shot.image, outer, fields), frame, stage, fields, layers)
     return _trimmed(shot._replace(image=photo.image), photo.glass, frame, outer, window)
 
 

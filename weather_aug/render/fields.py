@@ -21,6 +21,7 @@ from weather_aug.render.light import particle_colour
 from weather_aug.render.medium import Medium, Optics
 from weather_aug.render.options import RenderOptions
 from weather_aug.render.project import project, sorted_in_blocks
+from weather_aug.render.spray import spray_colour
 from weather_aug.weather import Weather
 
 Float32 = NDArray[np.float32]
@@ -103,8 +104,9 @@ def splats_of(
     carried: Float32,
     window: Window,
     shelter: Shelter | None,
+    spray: Float32 | None = None,
 ) -> Float32:
-    """Splats (M, 16) of all fields that touch the window, far to near.
+    """Splats (M, 16) of all fields and of spray that touch the window, far to near.
 
     Args:
         camera: Of the whole picture.
@@ -117,6 +119,7 @@ def splats_of(
         carried: Optical depth of drawn particles by depth.
         window: (top, left, height, width).
         shelter: Bridges and roofs.
+        spray: (N, 13) particles that vehicles raise.
     """
     clouds = [
         exposed(
@@ -128,6 +131,9 @@ def splats_of(
         for field, part in zip(fields, resolved, strict=True)
     ]
     colours = [particle_colour(field.population.kind, light) for field in fields]
+    if spray is not None and len(spray):
+        clouds.append(spray)
+        colours.append(spray_colour(light))
     return _projected(clouds, colours, optics, medium, carried, light.airlight, window, True)
 
 

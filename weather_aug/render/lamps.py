@@ -23,6 +23,7 @@ from weather_aug._checks import finite, like_image
 from weather_aug._keys import check_seed, key_of, uniforms
 from weather_aug.clip.types import Camera
 from weather_aug.colour import LUMINANCE
+from weather_aug.edit.physical.fresnel import fresnel
 from weather_aug.edit.physical.vehicles import Vehicle
 from weather_aug.render.lamp_light import HALO_AREA, HALO_EXPONENT, SeenLamp
 
@@ -56,7 +57,6 @@ OCCLUSION_M, OCCLUSION_RAMP_M = 0.7, 0.3
 """What is nearer than the lamp by more than the first hides it, by the second around that less and
 less: no lamp is switched on from one frame to the next."""
 MOST_DEPTH_TAU = 20.0
-WATER_INDEX = 1.333
 ROUGHNESS = 0.1
 """Root mean square slope of a wet road in the rain."""
 ROAD_CD = 1000.0
@@ -125,22 +125,6 @@ def _lamps_on(vehicle: Vehicle, up: Float64) -> list[Lamp]:
             place = vehicle.centre_world + offset + height_m * up
             lamps.append(Lamp(place, end * ahead, up, height_m, colour, *powers))
     return lamps
-
-
-def fresnel_water(grazing_rad: float) -> float:
-    """Share of unpolarised light that water mirrors at an angle to its surface, in [0.02, 1].
-
-    Args:
-        grazing_rad: Between ray and surface, radians, in [0, pi / 2].
-
-    Source:
-        Fresnel's equations, n = 1.333, mean of both polarisations.
-    """
-    sine = math.sin(grazing_rad)
-    inside = math.sqrt(WATER_INDEX**2 - math.cos(grazing_rad) ** 2)
-    across = ((sine - inside) / (sine + inside)) ** 2
-    along = ((WATER_INDEX**2 * sine - inside) / (WATER_INDEX**2 * sine + inside)) ** 2
-    return 0.5 * (across + along)
 
 
 def seen_lamps(
@@ -306,7 +290,7 @@ def _streak(lamp: Lamp, camera: Camera, distance_m: float, camera_height_m: floa
     behind = lamp.height_m / (lamp.height_m + camera_height_m)
     down_px = 2.0 * ROUGHNESS * fy * behind
     across_px = math.sin(grazing_rad) * down_px * fx / fy
-    return _Streak(*mirror, foot[1], fresnel_water(grazing_rad), across_px, down_px)
+    return _Streak(*mirror, foot[1], float(fresnel(grazing_rad)), across_px, down_px)
 
 
 def _pixel(camera: Camera, point_world: Float64) -> tuple[float, float]:

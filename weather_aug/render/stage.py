@@ -85,9 +85,13 @@ class Stage:
     options: RenderOptions
 
     def shaded(
-        self, fields: Sequence[ParticleField], shelter: Shelter | None, time_s: float
+        self,
+        fields: Sequence[ParticleField],
+        shelter: Shelter | None,
+        time_s: float,
+        spray: Float32 | None = None,
     ) -> Planes:
-        """The window with the weather's medium and particles."""
+        """The window with the weather's medium, its particles and the vehicles' spray (N, 13)."""
         weather = self.weather
         resolved, carried = resolved_of(fields, self.camera, self.options.max_particles)
         medium = medium_of(weather, fields, self.ambience)
@@ -103,6 +107,7 @@ class Stage:
             carried,
             self.window,
             shelter,
+            spray,
         )
         surface = self._scattered(air) if self.options.multiple_scattering else self.surface
         return self._run(surface, air, splats)

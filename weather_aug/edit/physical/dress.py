@@ -82,7 +82,7 @@ def dress(
         tint: (3,) float32 of the ground's gain.
         curve: (256,) float32 toned light by sRGB level.
         matrix: (3, 3) float32 colour matrix after it.
-        table: (256, 8) float32 materials.
+        table: (256, 9) float32 materials.
         maps: (18, h, w) float32 on the small grid of the whole picture.
         step: Pixels of a cell, float32.
         tile: Noise.

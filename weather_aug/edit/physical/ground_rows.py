@@ -18,6 +18,8 @@ ALONG, LEFT, SINE, SIZE, NOISE, LIT, SIDE, POOL, COVERED, MIRRORED = range(7, 17
 LANE_M, WHEEL_M, TRACK_M = 3.5, 0.75, 0.28
 """Width of a lane, wheels from its middle, half the width of a track."""
 SNOW_ALBEDO, ASPHALT_ALBEDO = 0.85, 0.12
+CLEAN, SLUSH = 0.90, 0.76
+"""Brightness of the darkest snow over the lightest, beside the road and on it."""
 GUESSED_HEIGHTS = (0.05, 0.20)
 """Over the road's plane, metres: where nobody labelled, what rises from it mirrors less."""
 MICRO_SLOPE = 0.25
@@ -50,7 +52,7 @@ def ground_run(run, depth, geometry, look, material, small, cell, share, tile, b
         depth: (W,) metres.
         geometry: Of the whole picture.
         look: Weather.
-        material: (8,) of the class.
+        material: (9,) of the class.
         small: (14, w) maps at this row.
         cell: (W,) for `spread_run`.
         share: (W,) for `spread_run`.
@@ -86,7 +88,7 @@ def ground_run(run, depth, geometry, look, material, small, cell, share, tile, b
         _mirror(x0, x1, look.flooded, b)
     if amount > zero:
         _cover(x0, x1, amount, b)
-        _lay(x0, x1, look, b)
+        _lay(x0, x1, look, np.float32(SLUSH) if road else np.float32(CLEAN), b)
 
 
 @inlined
@@ -187,8 +189,8 @@ def _cover(x0, x1, amount, b):
 
 
 @inlined
-def _lay(x0, x1, look, b):
-    """Snow over what lies there; a little of it shows through."""
+def _lay(x0, x1, look, least, b):
+    """Snow over what lies there, at `least` of its brightness; a little of that shows through."""
     asphalt = np.float32(ASPHALT_ALBEDO)
     grey = luminance(look.red, look.green, look.blue)
     for x in range(x0, x1):
@@ -196,7 +198,7 @@ def _lay(x0, x1, look, b):
         bright = snow_light(light, look)
         under = luminance(b[R, x], b[G, x], b[B, x]) / (asphalt * light)
         under = under if under < np.float32(2.0) else np.float32(2.0)
-        shade = np.float32(0.90) + np.float32(0.12) * b[NOISE, x]
+        shade = least + (np.float32(1.02) - least) * b[NOISE, x]
         shade *= np.float32(0.95) + np.float32(0.05) * under
         lay_snow(x, b[COVERED, x], bright * shade / grey, look, b)
 

@@ -16,7 +16,9 @@ CANYON_SHARE = 0.65
 """Of the sky that a street sees: a white surface there is this much of the sky's luminance."""
 EXPOSING_POWER = 0.6
 """How far the camera's automatic exposure follows; 1 would keep the street's luminance."""
-EXPOSURE_RANGE = (0.92, 1.8)
+EXPOSURE_RANGE = (1.0, 1.8)
+WET_EXPOSURE = 0.15
+"""How much longer the camera exposes a wet street, which is darker."""
 SNOW_EXPOSURE_LOSS = 0.15
 """How much darker all else comes out between white fields."""
 SNOW_SHARE_OF_SKY = 0.97
@@ -91,7 +93,9 @@ def look_of(
     values: dict[str, float] = dict(
         sky=drawn("sky", weather.overcast),
         flattening=overcast * (1.0 - CONTRAST_LOSS * overcast),
-        exposure=min(max(exposure, low), high) * (1.0 - SNOW_EXPOSURE_LOSS * snow),
+        exposure=min(max(exposure, low), high)
+        * (1.0 - SNOW_EXPOSURE_LOSS * snow)
+        * (1.0 + WET_EXPOSURE * drawn("film", weather.wetness)),
         zenith_gain=ZENITH_GAIN,
         red=ambience.airlight[0],
         green=ambience.airlight[1],

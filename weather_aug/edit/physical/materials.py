@@ -27,41 +27,43 @@ class Material(NamedTuple):
     """How far snow lies in its texture instead of on its surface."""
     level: float
     """How far its level parts (bonnets, roofs) hold snow."""
+    buried: float
+    """How far the snow on the ground lies over its foot: what moves stands on top of it."""
 
 
 _GROUND = {
-    "road": Material(1.0, 1.0, 1.0, 0.0, 0.0, 0.0),
-    "sidewalk": Material(1.0, 0.8, 0.97, 0.0, 0.0, 0.0),
-    "terrain": Material(0.7, 0.0, 1.0, 0.0, 0.0, 0.0),
+    "road": Material(1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0),
+    "sidewalk": Material(1.0, 0.8, 0.97, 0.0, 0.0, 0.0, 0.0),
+    "terrain": Material(0.7, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0),
 }
 _STANDING = {
-    "building": Material(0.8, 0.0, 0.9, 0.25, 0.0, 1.0),
-    "wall": Material(1.0, 0.0, 0.7, 0.12, 0.0, 0.0),
-    "fence": Material(0.5, 0.0, 0.4, 0.07, 0.0, 0.0),
-    "pole": Material(0.3, 0.0, 0.2, 0.06, 0.0, 0.0),
-    "traffic light": Material(0.0, 0.0, 0.2, 0.07, 0.0, 0.0),
-    "traffic sign": Material(0.0, 0.0, 0.2, 0.05, 0.0, 0.0),
-    "vegetation": Material(0.35, 0.0, 0.75, 0.0, 1.0, 0.0),
-    "person": Material(0.5, 0.0, 0.0, 0.0, 0.0, 0.0),
-    "rider": Material(0.5, 0.0, 0.0, 0.0, 0.0, 0.0),
-    "car": Material(0.0, 0.0, 0.75, 0.11, 0.0, 1.0),
-    "truck": Material(0.0, 0.0, 0.75, 0.11, 0.0, 1.0),
-    "bus": Material(0.0, 0.0, 0.75, 0.11, 0.0, 1.0),
-    "train": Material(0.0, 0.0, 0.75, 0.11, 0.0, 1.0),
-    "motorcycle": Material(0.0, 0.0, 0.1, 0.04, 0.0, 0.0),
-    "bicycle": Material(0.0, 0.0, 0.1, 0.0, 0.0, 0.0),
+    "building": Material(0.8, 0.0, 0.9, 0.25, 0.0, 1.0, 1.0),
+    "wall": Material(1.0, 0.0, 0.7, 0.12, 0.0, 0.0, 1.0),
+    "fence": Material(0.5, 0.0, 0.4, 0.07, 0.0, 0.0, 1.0),
+    "pole": Material(0.3, 0.0, 0.2, 0.06, 0.0, 0.0, 1.0),
+    "traffic light": Material(0.0, 0.0, 0.2, 0.07, 0.0, 0.0, 1.0),
+    "traffic sign": Material(0.0, 0.0, 0.2, 0.05, 0.0, 0.0, 1.0),
+    "vegetation": Material(0.35, 0.0, 0.75, 0.0, 1.0, 0.0, 1.0),
+    "person": Material(0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    "rider": Material(0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    "car": Material(0.0, 0.0, 0.75, 0.11, 0.0, 1.0, 0.0),
+    "truck": Material(0.0, 0.0, 0.75, 0.11, 0.0, 1.0, 0.0),
+    "bus": Material(0.0, 0.0, 0.75, 0.11, 0.0, 1.0, 0.0),
+    "train": Material(0.0, 0.0, 0.75, 0.11, 0.0, 1.0, 0.0),
+    "motorcycle": Material(0.0, 0.0, 0.1, 0.04, 0.0, 0.0, 0.0),
+    "bicycle": Material(0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.0),
 }
-MATERIALS = {**_GROUND, **_STANDING, "sky": Material(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)}
-POROSITY, MIRROR, COVER, CAP_M, LEAF, LEVEL, GROUND, ROAD = range(8)
+MATERIALS = {**_GROUND, **_STANDING, "sky": Material(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)}
+POROSITY, MIRROR, COVER, CAP_M, LEAF, LEVEL, BURIED, GROUND, ROAD = range(9)
 """Columns of the table: the fields of Material, whether a class is ground, whether it is road."""
 
 
 def material_table(*, labelled: bool) -> Float32:
-    """The materials by train id, (256, 8) float32; what has no class does nothing.
+    """The materials by train id, (256, 9) float32; what has no class does nothing.
 
     Where classes are guessed, what stands is of no known kind: snow lies on its edges only.
     """
-    table = np.zeros((256, 8), np.float32)
+    table = np.zeros((256, 9), np.float32)
     for name in CLASSES:
         row = table[TRAIN_ID[name]]
         row[: len(Material._fields)] = MATERIALS[name]

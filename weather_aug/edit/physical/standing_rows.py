@@ -13,7 +13,7 @@ from weather_aug.edit.physical.ground_rows import (
     ramp,
     snow_light,
 )
-from weather_aug.edit.physical.materials import CAP_M, COVER, LEAF, LEVEL, POROSITY
+from weather_aug.edit.physical.materials import BURIED, CAP_M, COVER, LEAF, LEVEL, POROSITY
 from weather_aug.edit.physical.noise import ground_noise
 from weather_aug.edit.physical.spread import spread_run
 
@@ -103,6 +103,6 @@ def standing_run(run, depth, geometry, look, material, small, cell, share, tile,
                 cover = max(cover, lies)
         buried = look.snow_depth_m * (np.float32(0.6) + np.float32(0.8) * noise)
         if (height < buried) & (z < np.float32(BURIED_RANGE_M)):
-            cover = max(cover, look.snow)
+            cover = max(cover, look.snow * material[BURIED])
         grey = luminance(look.red, look.green, look.blue)
         lay_snow(x, cover, bright / grey, look, b)

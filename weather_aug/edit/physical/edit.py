@@ -57,11 +57,14 @@ def edited(
     look = look_of(weather, ambience, layers.illumination, without)
     curve, matrix = tone(0.0 if "relight" in without else weather.overcast)
     labelled = frame.label is not None
+    # Read-only as a scene's labels are: the kernel would be compiled once more for others.
+    classes = layers.classes.reshape(-1)
+    classes.flags.writeable = False
     _, _, height, width = window
     out = np.empty((3, height, width), np.uint8)
     dress(
         surface_of(frame),
-        layers.classes.reshape(-1),
+        classes,
         window,
         geometry_of(frame.camera, ambience.axes_world, layers.plane, labelled=labelled),
         look,

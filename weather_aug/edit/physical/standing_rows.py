@@ -97,6 +97,8 @@ def standing_run(run, depth, geometry, look, material, small, cell, share, tile,
             edge += np.float32(0.4) * look.snow_depth_m
             below = b[BELOW_TOP, x]
             cover = one - ramp(np.float32(0.7) * edge, np.float32(1.2) * edge, below)
+            # A cap thinner than a pixel covers a part of it.
+            cover *= min(edge / size, one)
             if material[LEVEL] > zero:
                 level = ramp(np.float32(0.55), np.float32(0.85), b[LIT + 2, x])
                 lies = covered(amount * level, np.float32(0.07) + np.float32(0.25) * size, noise)

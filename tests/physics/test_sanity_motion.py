@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from air_only import air_only
 from oracles import faults
 from particles.particle_scene import AXES, camera, inside, whole
 from physics_scene import measured

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import operator
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -207,6 +206,6 @@ def _recipe(
             "weather": draw.weather.to_dict(),
             "seed": draw.seed,
             "window": window,
-            "options": asdict(options),
+            "options": options.to_dict(),
         }
     )

@@ -10,33 +10,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from weather_aug._compiled import compiled, inlined
+from weather_aug._compiled import compiled
 from weather_aug._rows import encode_row, survival
+from weather_aug.edit.physical.buffer import BELOW_TOP, FREE, GROUNDED, LUMA, ROWS, SKYNESS, B, G, R
 from weather_aug.edit.physical.ground_rows import ground_run
+from weather_aug.edit.physical.layer_rows import load_row
+from weather_aug.edit.physical.layers import GROUND_GAIN, MATTE
 from weather_aug.edit.physical.materials import CAP_M, COVER, GROUND, LEAF, POROSITY
+from weather_aug.edit.physical.noise_rows import KNOT_PX, knots_across, noise_row
 from weather_aug.edit.physical.relight import LEAST_GAIN, MOST_GAIN, SKY_FEATURE
 from weather_aug.edit.physical.spread import spread_run
-from weather_aug.edit.physical.standing_rows import caps_row, film_run, standing_run
-from weather_aug.edit.surface import depth_row, light_row
+from weather_aug.edit.physical.standing_rows import NO_CAP_M, caps_row, film_run, standing_run
+from weather_aug.edit.surface import depth_row
 
 CAP_ROWS = 96
 """How far above a window the upper edges of things are looked for, pixels."""
-NO_CAP_M = 99.0
 
-R, G, B, LUMA = range(4)
-"""Rows of the buffer: linear light, and the recorded picture's sRGB luma."""
-BELOW_TOP, DEPTH_ABOVE = 4, 5
-"""How far below its own upper edge a pixel lies, metres; depth of the pixel above it."""
-SKYNESS = 6
-"""The recorded picture's feature of the sky."""
-FREE = 7
-"""First row that the runs may use."""
-BUFFER_ROWS = 24
-
-GROUND_GAIN, OBJECT_GAIN, MATTE, LIGHT = 0, 4, 6, 8
-SHARP, MAPS = 12, 18
-"""Where the kernel's maps are in their stack: those of `layers`, but what is mirrored is three
-colours under the weather's light, twice."""
+MAPS = 18
+"""Those of `layers`, but what is mirrored is three colours under the weather's light, twice."""
 OBJECT_GAINS = (np.float32(LEAST_GAIN), np.float32(MOST_GAIN))
 
 
@@ -69,32 +60,42 @@ class Geometry(NamedTuple):
 
 @compiled
 def dress(
-    surface, classes, window, geometry, look, tint, curve, matrix, table, maps, step, tile, out
+    planes, surface, classes, window, geometry, look, tint, tone, table, layers, step, tile, out
 ):
     """Paint one window's background in the weather.
 
     Args:
-        surface: The recorded picture.
+        planes: (3, H, W) uint8 sRGB of the window.
+        surface: The whole picture's depth and label.
         classes: (N,) uint8 train ids of the whole picture, guessed where nobody labelled.
         window: (top, left, height, width) in the whole picture.
         geometry: Camera of the whole picture.
         look: Weather.
         tint: (3,) float32 of the ground's gain.
-        curve: (256,) float32 toned light by sRGB level.
-        matrix: (3, 3) float32 colour matrix after it.
+        tone: (256,) float32 light by sRGB level and by square root of light (1024,), toned, and
+            the (3, 3) float32 colour matrix after it.
         table: (256, 9) float32 materials.
-        maps: (18, h, w) float32 on the small grid of the whole picture.
+        layers: (20, h, w) uint16, bits of the float16 layers of the whole picture.
         step: Pixels of a cell, float32.
         tile: Noise.
         out: (3, H, W) uint8 out.
     """
     top, left, height, width = window
-    columns = maps.shape[2]
-    b = np.zeros((BUFFER_ROWS, width + 16), np.float32)
-    small = np.empty((MAPS, columns), np.float32)
-    cell = np.empty(width, np.int32)
+    curve, by_root, matrix = tone
+    rows, columns = layers.shape[1], layers.shape[2]
+    b = np.zeros((ROWS, width + 16), np.float32)
+    pair = np.zeros((2, MAPS, columns), np.float32)
+    at = np.array([-1, -1])
+    scratch = np.empty((4, columns), np.float32)
+    # One more, so that the last cell has a next one.
+    small = np.zeros((MAPS, columns + 1), np.float32)
+    cell = np.empty(width, np.uint32)
     share = np.empty(width, np.float32)
     _cells(left, width, step, columns, cell, share)
+    first_cell, last_cell = np.int64(cell[0]), min(np.int64(cell[width - 1]) + 2, columns)
+    count, _ = knots_across(left, width, surface.width)
+    knots = np.empty((2, count), np.float32)
+    knot_depth = np.empty(count * KNOT_PX, np.float32)
     kinds = np.empty(width, np.uint8)
     class_above = np.full(width, np.uint8(255), np.uint8)
     for x in range(width):
@@ -103,6 +104,7 @@ def dress(
     bits = depth.view(np.int32)
     zero = np.float32(0.0)
     snowy = (look.snow > zero) | (look.road_snow > zero)
+    pools = (look.puddles > zero) & (look.mirror > zero)
     wet = (look.film > zero) | (look.mirror > zero)
     start = max(top - CAP_ROWS, 0) if look.snow > zero else top
     for y in range(start, top + height):
@@ -114,12 +116,26 @@ def dress(
             caps_row(kinds, depth, geometry.fy, b, class_above)
         if y < top:
             continue
-        has_sky = _small_row(maps, y, step, small)
-        light_row(surface, y, left, curve, b[R, :width], b[G, :width], b[B, :width])
-        luma_row(surface, y, left, b)
+        place = (np.float32(y) + np.float32(0.5)) / step - np.float32(0.5)
+        place = min(max(place, zero), np.float32(rows - 1))
+        upper = min(np.int32(place), np.int32(max(rows - 2, 0)))
+        lower = min(upper + 1, rows - 1)
+        for row in range(upper, lower + 1):
+            if at[row % 2] != row:
+                cells = (row, first_cell, last_cell)
+                load_row(layers, cells, by_root, matrix, look, scratch, pair[row % 2])
+                at[row % 2] = row
+        down = place - np.float32(upper)
+        _lerp_rows(pair, upper % 2, lower % 2, down, first_cell, last_cell, small)
+        _light(planes, y - top, curve, width, b)
         if look.flattening > zero:
             _flatten(kinds, table, small, cell, share, look, tint, width, b)
         _tone(look.exposure, matrix, width, b)
+        if snowy or pools:
+            noise_row(
+                *(surface, classes, y, left, width, geometry, table, tile),
+                *(pools, knots, knot_depth, b),
+            )
         if snowy or wet:
             x0 = 0
             while x0 < width:
@@ -128,19 +144,17 @@ def dress(
                 while x1 < width and kinds[x1] == kind:
                     x1 += 1
                 material = table[kind]
-                run = (x0, x1, left, y)
+                run = (np.uint64(x0), np.uint64(x1), np.float32(left), np.float32(y))
                 if material[GROUND] > zero:
-                    ground_run(run, depth, geometry, look, material, small, cell, share, tile, b)
+                    ground_run(run, depth, geometry, look, material, small, cell, share, b)
                 else:
                     if look.film > zero and material[POROSITY] > zero:
                         film_run(run, look, material, small, cell, share, b)
                     holds = (material[CAP_M] > zero) | (material[LEAF] > zero)
                     if look.snow > zero and holds and material[COVER] > zero:
-                        standing_run(
-                            run, depth, geometry, look, material, small, cell, share, tile, b
-                        )
+                        standing_run(run, depth, geometry, look, material, small, cell, share, b)
                 x0 = x1
-        if has_sky and look.sky > zero:
+        if look.sky > zero and _any_sky(small, first_cell, last_cell):
             _sky(small, cell, share, left, y, geometry, look, width, b)
         for channel in range(3):
             encode_row(b[channel, :width], out[channel, y - top])
@@ -153,88 +167,63 @@ def _cells(left, width, step, columns, cell, share):
         place = (np.float32(left + x) + np.float32(0.5)) / step - np.float32(0.5)
         place = min(max(place, np.float32(0.0)), np.float32(columns - 1))
         first = min(np.int32(place), np.int32(max(columns - 2, 0)))
-        cell[x] = first
+        cell[x] = np.uint32(first)
         share[x] = place - np.float32(first)
 
 
 @compiled
-def _small_row(maps, y, step, small):
-    """All maps at the height of picture row y; whether any of its cells may be sky."""
-    rows, columns = maps.shape[1], maps.shape[2]
-    place = (np.float32(y) + np.float32(0.5)) / step - np.float32(0.5)
-    place = min(max(place, np.float32(0.0)), np.float32(rows - 1))
-    upper = min(np.int32(place), np.int32(max(rows - 2, 0)))
-    lower = min(upper + 1, rows - 1)
-    down = place - np.float32(upper)
+def _lerp_rows(pair, above, below, down, first, last, small):
     for k in range(MAPS):
-        for j in range(columns):
-            first = maps[k, upper, j]
-            small[k, j] = first + down * (maps[k, lower, j] - first)
-    sky = np.float32(0.0)
-    for j in range(columns):
-        sky += abs(small[MATTE, j]) + abs(small[MATTE + 1, j])
-    return sky > np.float32(0.0)
+        for j in range(first, last):
+            value = pair[above, k, j]
+            small[k, j] = value + down * (pair[below, k, j] - value)
 
 
 @compiled
-def luma_row(surface, y, left, b):
-    """The recorded picture's sRGB luma and its feature of the sky."""
-    top_, left_, _, stride = surface.image_window
-    start = (y - top_) * stride + left - left_
-    width = b.shape[1] - 16
-    image = surface.image[start : start + width]
+def _any_sky(small, first, last):
+    total = np.float32(0.0)
+    for j in range(first, last):
+        total = max(total, max(abs(small[MATTE, j]), abs(small[MATTE + 1, j])))
+    return total > np.float32(0.0)
+
+
+@compiled
+def _light(planes, row, curve, width, b):
+    """Linear light of a row, its sRGB luma, and its feature of the sky."""
+    for channel in range(3):
+        for x in range(width):
+            b[channel, x] = curve[planes[channel, row, x]]
     for x in range(width):
         b[LUMA, x] = (
-            np.float32(0.2126 / 255) * np.float32(image[x, 0])
-            + np.float32(0.7152 / 255) * np.float32(image[x, 1])
-            + np.float32(0.0722 / 255) * np.float32(image[x, 2])
+            np.float32(0.2126 / 255) * np.float32(planes[0, row, x])
+            + np.float32(0.7152 / 255) * np.float32(planes[1, row, x])
+            + np.float32(0.0722 / 255) * np.float32(planes[2, row, x])
         )
     red, blue = np.float32(SKY_FEATURE[0] / 255), np.float32(SKY_FEATURE[2] / 255)
     for x in range(width):
-        b[SKYNESS, x] = red * np.float32(image[x, 0]) + blue * np.float32(image[x, 2])
+        b[SKYNESS, x] = red * np.float32(planes[0, row, x]) + blue * np.float32(planes[2, row, x])
 
 
 @compiled
 def _flatten(kinds, table, small, cell, share, look, tint, width, b):
-    """The sun's light and shadow go, by runs of ground and of what stands."""
-    x0 = 0
-    while x0 < width:
-        ground = table[kinds[x0], GROUND] > np.float32(0.0)
-        x1 = x0 + 1
-        while x1 < width and (table[kinds[x1], GROUND] > np.float32(0.0)) == ground:
-            x1 += 1
-        if ground:
-            spread_run(small, GROUND_GAIN, 4, cell, share, x0, x1, b, FREE)
-            _ground_gain(x0, x1, look.flattening, tint, b)
-        else:
-            spread_run(small, OBJECT_GAIN, 2, cell, share, x0, x1, b, FREE)
-            _object_gain(x0, x1, look.flattening, b)
-        x0 = x1
-
-
-@inlined
-def _ground_gain(x0, x1, strength, tint, b):
+    """The sun's light and shadow go."""
     zero = np.float32(0.0)
-    for x in range(x0, x1):
-        gain = b[FREE, x] * b[LUMA, x] + b[FREE + 1, x]
-        gain = max(gain, b[FREE + 2, x])
-        b[FREE, x] = strength * min(gain, b[FREE + 3, x])
-    for channel in range(3):
-        for x in range(x0, x1):
-            gain = b[FREE, x]
-            gain += tint[channel] * max(gain, zero)
-            b[channel, x] *= survival(-gain)
-
-
-@inlined
-def _object_gain(x0, x1, strength, b):
     least, most = OBJECT_GAINS
-    for x in range(x0, x1):
-        gain = b[FREE, x] * b[LUMA, x] + b[FREE + 1, x]
-        b[FREE, x] = survival(-strength * min(max(gain, least), most))
+    for x in range(width):
+        b[GROUNDED, x] = table[kinds[x], GROUND]
+    spread_run(small, GROUND_GAIN, 6, cell, share, np.uint64(0), np.uint64(width), b, FREE)
+    for x in range(width):
+        ground = b[FREE, x] * b[LUMA, x] + b[FREE + 1, x]
+        ground = min(max(ground, b[FREE + 2, x]), b[FREE + 3, x])
+        other = b[FREE + 4, x] * b[LUMA, x] + b[FREE + 5, x]
+        other = min(max(other, least), most)
+        b[FREE, x] = look.flattening * (ground if b[GROUNDED, x] > zero else other)
+    for x in range(width):
+        b[FREE + 1, x] = max(b[FREE, x], zero) * b[GROUNDED, x]
     for channel in range(3):
-        for x in range(x0, x1):
-            b[channel, x] *= b[FREE, x]
+        shift = tint[channel]
+        for x in range(width):
+            b[channel, x] *= survival(-(b[FREE, x] + shift * b[FREE + 1, x]))
 
 
 @compiled
@@ -251,7 +240,7 @@ def _tone(exposure, matrix, width, b):
 def _sky(small, cell, share, left, y, geometry, look, width, b):
     """An overcast sky where the sky is, also between leaves."""
     zero, one = np.float32(0.0), np.float32(1.0)
-    spread_run(small, MATTE, 2, cell, share, 0, width, b, FREE)
+    spread_run(small, MATTE, 2, cell, share, np.uint64(0), np.uint64(width), b, FREE)
     ray_y = (np.float32(y) - geometry.cy) / geometry.fy
     rise = geometry.climb_y * ray_y + geometry.climb_z
     across = one + ray_y * ray_y

@@ -4,20 +4,36 @@ from __future__ import annotations
 
 import numpy as np
 
-from weather_aug._compiled import inlined
+from weather_aug._compiled import compiled, inlined
+from weather_aug.edit.physical.buffer import (
+    COVERED,
+    HEIGHT,
+    LIE,
+    LIT,
+    MIRRORED,
+    NOISE,
+    POOL,
+    SIDE,
+    SINE,
+    SIZE,
+    B,
+    G,
+    R,
+)
 from weather_aug.edit.physical.fresnel import film_ratio_of, fresnel_of_sine
+from weather_aug.edit.physical.layers import ILLUMINATION, LATERAL_M, SHARP
 from weather_aug.edit.physical.materials import COVER, MIRROR, POROSITY, ROAD
-from weather_aug.edit.physical.noise import ground_noise
+from weather_aug.edit.physical.ripples import ripple
 from weather_aug.edit.physical.spread import spread_run
-
-R, G, B = range(3)
-LIGHT, LATERAL, SHARP = 8, 11, 12
-ALONG, LEFT, SINE, SIZE, NOISE, LIT, SIDE, POOL, COVERED, MIRRORED = range(7, 17)
-"""Rows of the buffer that a run uses; the mirrored light takes six from MIRRORED on."""
 
 LANE_M, WHEEL_M, TRACK_M = 3.5, 0.75, 0.28
 """Width of a lane, wheels from its middle, half the width of a track."""
 SNOW_ALBEDO, ASPHALT_ALBEDO = 0.85, 0.12
+FLATTEST_SINE = 0.02
+RUT_WATER = 1.5
+"""How much more water stands in wheel tracks, as a share."""
+POOL_DARKENING = 0.2
+"""Of what lies under standing water, besides the film's."""
 CLEAN, SLUSH = 0.90, 0.76
 """Brightness of the darkest snow over the lightest, beside the road and on it."""
 GUESSED_HEIGHTS = (0.05, 0.20)
@@ -43,21 +59,21 @@ def covered(amount, fuzz, noise):
     return ramp(threshold - fuzz, threshold + fuzz, noise)
 
 
-@inlined
-def ground_run(run, depth, geometry, look, material, small, cell, share, tile, b):
+@compiled
+def ground_run(run, depth, geometry, look, material, small, cell, share, b):
     """Wet and snow on pixels x0 to x1 of one ground class.
 
     Args:
-        run: (x0, x1, left, y): pixels of the window's row, and where its row starts in the picture.
+        run: (x0, x1, left, y): pixels of the window's row, unsigned (see `spread_run`), and where
+            the row starts in the picture, float32.
         depth: (W,) metres.
         geometry: Of the whole picture.
         look: Weather.
         material: (9,) of the class.
-        small: (14, w) maps at this row.
+        small: (18, w) maps at this row.
         cell: (W,) for `spread_run`.
         share: (W,) for `spread_run`.
-        tile: Noise.
-        b: Buffer; its first three rows are the light.
+        b: Buffer, with the light and the noise of the row.
     """
     x0, x1, _, _ = run
     zero = np.float32(0.0)
@@ -66,25 +82,18 @@ def ground_run(run, depth, geometry, look, material, small, cell, share, tile, b
     pools = look.puddles if road else zero
     shine = look.mirror * material[MIRROR]
     _places(run, depth, geometry, b)
-    spread_run(small, LIGHT, 1, cell, share, x0, x1, b, LIT)
+    spread_run(small, ILLUMINATION, 1, cell, share, x0, x1, b, LIT)
     if amount > zero or pools > zero:
-        for x in range(x0, x1):
-            b[NOISE, x] = ground_noise(tile, b[ALONG, x], b[LEFT, x], b[SIZE, x], zero)
-        spread_run(small, LATERAL, 1, cell, share, x0, x1, b, SIDE)
+        spread_run(small, LATERAL_M, 1, cell, share, x0, x1, b, SIDE)
         _tracks(x0, x1, look.tracks if road else zero, b)
     if look.film > zero:
-        film(x0, x1, look.film * material[POROSITY], LIT, b)
+        film(x0, x1, look.film * material[POROSITY], b)
     if shine > zero:
         spread_run(small, SHARP, 6, cell, share, x0, x1, b, MIRRORED)
-        if pools > zero:
-            for x in range(x0, x1):
-                lie = ground_noise(tile, b[ALONG, x], b[LEFT, x], b[SIZE, x], np.float32(11.3))
-                more = np.float32(1.0) + np.float32(1.5) * b[SIDE, x]
-                b[POOL, x] = covered(pools * more, _fuzz(b[SIZE, x]), lie)
-        else:
-            for x in range(x0, x1):
-                b[POOL, x] = zero
-        _shine(run, depth, geometry, shine, b)
+        _pools(x0, x1, pools, b)
+        _shine(x0, x1, shine, geometry.labelled, b)
+        if look.ripples > zero:
+            ripple(run, depth, geometry, look, b)
         _mirror(x0, x1, look.flooded, b)
     if amount > zero:
         _cover(x0, x1, amount, b)
@@ -98,30 +107,26 @@ def _fuzz(size_m):
     return soft if soft < np.float32(0.5) else np.float32(0.5)
 
 
-@inlined
+@compiled
 def _places(run, depth, geometry, b):
-    """Where the pixels are on the street, how flat they are seen, and how large they are."""
+    """How flat the pixels are seen, how long they are on the ground, and how high they lie."""
     x0, x1, left, y = run
     one, steepest = np.float32(1.0), np.float32(0.004)
-    ray_y = (np.float32(y) - geometry.cy) / geometry.fy
-    along_y = geometry.along_y * ray_y + geometry.along_z
-    left_y = geometry.left_y * ray_y + geometry.left_z
+    ray_y = (y - geometry.cy) / geometry.fy
     climb_y = geometry.climb_y * ray_y + geometry.climb_z
     per_fx, per_fy = one / geometry.fx, one / geometry.fy
     across = one + ray_y * ray_y
     for x in range(x0, x1):
-        z = depth[x]
-        z = z if z < np.float32(1e4) else np.float32(1e4)
-        ray_x = (np.float32(left + x) - geometry.cx) * per_fx
-        b[ALONG, x] = geometry.along_0 + z * (geometry.along_x * ray_x + along_y)
-        b[LEFT, x] = geometry.left_0 + z * (geometry.left_x * ray_x + left_y)
-        sine = -(geometry.climb_x * ray_x + climb_y) / np.sqrt(across + ray_x * ray_x)
-        sine = sine if sine > steepest else steepest
+        z = min(depth[x], np.float32(1e4))
+        ray_x = (left + np.float32(x) - geometry.cx) * per_fx
+        climb = geometry.climb_x * ray_x + climb_y
+        sine = max(-climb / np.sqrt(across + ray_x * ray_x), steepest)
         b[SINE, x] = sine
-        b[SIZE, x] = z * per_fy / (sine if sine > np.float32(0.02) else np.float32(0.02))
+        b[SIZE, x] = z * per_fy / max(sine, np.float32(FLATTEST_SINE))
+        b[HEIGHT, x] = geometry.height_0 + z * climb
 
 
-@inlined
+@compiled
 def _tracks(x0, x1, strength, b):
     """From how far left of the way to how far in a wheel's track; other lanes are driven less."""
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
@@ -134,53 +139,58 @@ def _tracks(x0, x1, strength, b):
         b[SIDE, x] = strength * track * (driven if driven > zero else zero)
 
 
-@inlined
-def film(x0, x1, wet, lit, b):
-    """Darken a run under a film of water; row `lit` of the buffer is the light on it."""
+@compiled
+def film(x0, x1, wet, b):
+    """Darken a run under a film of water."""
     least, most, one = np.float32(0.01), np.float32(0.95), np.float32(1.0)
-    for x in range(x0, x1):
-        bare = one / max(b[lit, x], np.float32(0.02))
-        for channel in range(3):
+    for channel in range(3):
+        for x in range(x0, x1):
             value = b[channel, x]
-            albedo = value * bare
-            albedo = albedo if albedo > least else least
-            albedo = albedo if albedo < most else most
+            albedo = value / max(b[LIT, x], np.float32(0.02))
+            albedo = min(max(albedo, least), most)
             b[channel, x] = value * (one + wet * (film_ratio_of(albedo) - one))
 
 
-@inlined
-def _shine(run, depth, geometry, shine, b):
-    """How far each pixel's water mirrors; puddles lie where it does."""
-    x0, x1, left, y = run
-    low, high = GUESSED_HEIGHTS
-    ray_y = (np.float32(y) - geometry.cy) / geometry.fy
-    climb_y = geometry.climb_y * ray_y + geometry.climb_z
+@compiled
+def _pools(x0, x1, share, b):
+    """Standing water; more of it in the ruts."""
+    one = np.float32(1.0)
     for x in range(x0, x1):
-        ray_x = (np.float32(left + x) - geometry.cx) / geometry.fx
-        height = geometry.height_0 + depth[x] * (geometry.climb_x * ray_x + climb_y)
-        level = np.float32(1.0) - ramp(np.float32(low), np.float32(high), height)
-        b[COVERED, x] = shine * (geometry.labelled + (np.float32(1.0) - geometry.labelled) * level)
+        amount = share * (one + np.float32(RUT_WATER) * b[SIDE, x])
+        b[POOL, x] = covered(amount, _fuzz(b[SIZE, x]), b[LIE, x])
 
 
-@inlined
+@compiled
+def _shine(x0, x1, shine, labelled, b):
+    """How far each pixel's water mirrors; where nobody labelled, only what lies in the plane."""
+    one = np.float32(1.0)
+    low, high = np.float32(GUESSED_HEIGHTS[0]), np.float32(GUESSED_HEIGHTS[1])
+    for x in range(x0, x1):
+        level = one - ramp(low, high, b[HEIGHT, x])
+        b[COVERED, x] = shine * (labelled + (one - labelled) * level)
+
+
+@compiled
 def _mirror(x0, x1, flooded_share, b):
     """What the film and the puddles mirror."""
     one = np.float32(1.0)
     slope2 = np.float32(MICRO_SLOPE * MICRO_SLOPE)
     for x in range(x0, x1):
-        sine, pool, shine = b[SINE, x], b[POOL, x], b[COVERED, x]
-        flooded = flooded_share + pool * (one - flooded_share)
+        sine, shine = b[SINE, x], b[COVERED, x]
+        flooded = flooded_share + b[POOL, x] * (one - flooded_share)
         rough = fresnel_of_sine(np.sqrt(sine * sine + slope2))
-        stones = shine * (one - flooded) * np.float32(0.5) * rough
-        calm = shine * flooded * fresnel_of_sine(sine)
-        kept = (one - stones - calm) * (one - np.float32(0.2) * pool)
-        for channel in range(3):
+        b[SINE, x] = shine * (one - flooded) * np.float32(0.5) * rough
+        b[COVERED, x] = shine * flooded * fresnel_of_sine(sine)
+    for channel in range(3):
+        for x in range(x0, x1):
+            pool, stones, calm = b[POOL, x], b[SINE, x], b[COVERED, x]
+            kept = (one - stones - calm) * (one - np.float32(POOL_DARKENING) * pool)
             sharp, smeared = b[MIRRORED + channel, x], b[MIRRORED + 3 + channel, x]
-            sharp = smeared + pool * (sharp - smeared)
-            b[channel, x] = kept * b[channel, x] + stones * smeared + calm * sharp
+            calm *= smeared + pool * (sharp - smeared)
+            b[channel, x] = kept * b[channel, x] + stones * smeared + calm
 
 
-@inlined
+@compiled
 def _cover(x0, x1, amount, b):
     one = np.float32(1.0)
     for x in range(x0, x1):
@@ -188,7 +198,7 @@ def _cover(x0, x1, amount, b):
         b[COVERED, x] = covered(spared, _fuzz(b[SIZE, x]), b[NOISE, x])
 
 
-@inlined
+@compiled
 def _lay(x0, x1, look, least, b):
     """Snow over what lies there, at `least` of its brightness; a little of that shows through."""
     asphalt = np.float32(ASPHALT_ALBEDO)

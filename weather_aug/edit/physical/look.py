@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from typing import NamedTuple
 
@@ -23,6 +24,10 @@ SNOW_EXPOSURE_LOSS = 0.15
 """How much darker all else comes out between white fields."""
 SNOW_SHARE_OF_SKY = 0.97
 """Most luminance of snow over the horizon's."""
+RIPPLING_MM_PER_H = 10.0
+"""Rain that leaves no place without rings."""
+RIPPLES_PERIOD_S = 3600.0
+"""After which the rings repeat: single precision knows no later milliseconds."""
 FILM_FLOODED, RAIN_FLOODED, FLOODING_MM_PER_H = 0.15, 0.55, 75.0
 """Share of a wet road where the film covers the stones, at rest and in the heaviest rain."""
 
@@ -55,6 +60,10 @@ class Look(NamedTuple):
     """1 where wheels keep snow off the road, else 0."""
     snow_light: np.float32
     """Most luminance of snow."""
+    ripples: np.float32
+    """Share of the places where a drop has just drawn a ring."""
+    time_s: np.float32
+    """For the rings."""
 
 
 def changes_background(weather: Weather, without: Collection[str] = ()) -> bool:
@@ -70,7 +79,11 @@ def changes_background(weather: Weather, without: Collection[str] = ()) -> bool:
 
 
 def look_of(
-    weather: Weather, ambience: Ambience, illumination: float, without: Collection[str]
+    weather: Weather,
+    ambience: Ambience,
+    illumination: float,
+    time_s: float,
+    without: Collection[str],
 ) -> Look:
     """The numbers of a weather under a scene's light.
 
@@ -78,6 +91,7 @@ def look_of(
         weather: State of air and ground.
         ambience: Its airlight is the overcast sky's colour at the horizon.
         illumination: Luminance of a white surface in the recorded street, linear light.
+        time_s: Of the picture, seconds.
         without: Effects that are left out.
     """
 
@@ -109,5 +123,7 @@ def look_of(
         snow_depth_m=drawn("snow_cover", weather.snow_depth_m),
         tracks=drawn("tracks", 1.0),
         snow_light=SNOW_SHARE_OF_SKY * white,
+        ripples=drawn("ripples", min(weather.rain_mm_per_h / RIPPLING_MM_PER_H, 1.0)),
+        time_s=math.fmod(time_s, RIPPLES_PERIOD_S),
     )
     return Look(**{name: np.float32(value) for name, value in values.items()})

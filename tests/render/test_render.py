@@ -12,8 +12,10 @@ from render_scene import make_camera, make_frame
 from weather_aug.air import Air
 from weather_aug.clip.types import Frame
 from weather_aug.edit.ambience import Ambience, airlight_from_sky, ambience_of
+from weather_aug.edit.physical.layers import SHARP
 from weather_aug.edit.surface import depth_of, surface_of
 from weather_aug.errors import ArgumentError
+from weather_aug.render.background import looked_at
 from weather_aug.render.compose import checked_window, render
 from weather_aug.render.options import RenderOptions
 from weather_aug.scene.policy import weather_of
@@ -194,6 +196,21 @@ def test_odd_sizes(shape, kind):
     frame = street_frame(width=shape[1], height=shape[0])
     shot = render(frame, weather_of(kind, 1.0), seed=0, ambience=AMBIENCE)
     assert (*shape, 3) == shot.image.shape
+
+
+def test_a_picture_of_the_sky_and_the_tops_of_houses_is_whole():
+    """Nothing below the horizon: there is no road, and nothing to mirror."""
+    frame = street_frame()
+    camera = frame.camera
+    intrinsics = camera.intrinsics.copy()
+    intrinsics[1, 2] += 500.0
+    frame = replace(frame, camera=replace(camera, intrinsics=intrinsics))
+    first, again = (
+        render(frame, Weather.rain("heavy"), seed=0, ambience=AMBIENCE).image for _ in range(2)
+    )
+    np.testing.assert_array_equal(first, again)
+    layers = looked_at(frame, AMBIENCE)
+    assert not layers.maps[SHARP:].any()
 
 
 def test_depth_that_is_missing_or_nonsense_means_far():

@@ -95,8 +95,9 @@ def add_lamps(
         if lamp.streak > 0:
             _mirror(lamp, patch, mirrors, light)
     # Into an array of its own: the kernel would be compiled once more for a part of one.
-    lit = np.empty((height, width, 3), np.uint8)
-    _expose(np.ascontiguousarray(out[part]), light, _LINEAR, _BORDERS, lit)
+    dark = np.ascontiguousarray(out[part])
+    lit = dark.copy()
+    _expose(dark, light, _LINEAR, _BORDERS, lit)
     out[part] = lit
     return out
 

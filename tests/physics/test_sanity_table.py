@@ -2,7 +2,7 @@
 
 Each check is a function `check_*` that a test runs once on the package (it passes) and once on each
 planted fault (it fails; tests named `..._found_out`). The numbers are those of the
-table of promises in docs/physics.md; 14 is kept for the wet road, 15 is in the labels' own tests.
+table of promises in docs/physics.md; 14 is kept for the wet road.
 
 no  what                         check (file test_sanity_..., function)       planted faults
 1   Beer and Lambert, scatter    extinction.check_beer_lambert                paper's opacities
@@ -35,6 +35,10 @@ no  what                         check (file test_sanity_..., function)       pl
 13  ... height fog               fog.check_height_fog                         even, surface, depth
 13  ... its kernel               fog.check_kernel                             depth for range
 13  ... sky                      fog.check_sky                                box of 80 m
+15  labels' ids                  labels.check_ids                             colours, mixed, snow
+15  ... and classes              labels.check_never_from_the_picture          colours, snow
+15  ... ignored grows            labels.check_ignored_grows                   re-roll, turns back
+15  ... but not in moderate fog  labels.check_moderate_fog_hides_little       half hidden
 16  sky rule                     severity.check_sky                           greys, dilation
 """
 
@@ -49,7 +53,7 @@ HERE = Path(__file__).parent
 
 
 def test_every_number_has_a_row():
-    assert {int(number) for number, _, _ in ROWS} == {*range(1, 14), 16}
+    assert {int(number) for number, _, _ in ROWS} == {*range(1, 14), 15, 16}
 
 
 @pytest.mark.parametrize(("number", "file", "name"), ROWS)

@@ -19,7 +19,16 @@ from weather_aug.errors import ArgumentError
 from weather_aug.particles.shelter import Shelter
 from weather_aug.render.background import background_of, looked_at
 from weather_aug.render.fields import RigMotion, fields_of
-from weather_aug.render.label import NEIGHBOURHOOD_PX, readable_labels
+from weather_aug.render.label import (
+    DOUBTFUL_TRANSMITTANCE,
+    MARGIN_PX,
+    Sight,
+    kept_labels,
+    readable_labels,
+)
+from weather_aug.render.label_runs import small_things
+from weather_aug.render.label_snow import buried_borders, covered_faces, snow_limits
+from weather_aug.render.label_weight import loss_weight_of
 from weather_aug.render.lens import Glass
 from weather_aug.render.lens_wiper import CROSSING, wiper_of
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
@@ -27,7 +36,7 @@ from weather_aug.render.scattering import scattering_margin_px
 from weather_aug.render.stage import Planes, Stage
 from weather_aug.render.taken import camera_in, taken, window_taken
 from weather_aug.render.traffic import traffic_of
-from weather_aug.taxonomy import SKY
+from weather_aug.taxonomy import IGNORE, SIDEWALK, SKY, TRAIN_ID
 from weather_aug.weather import Weather
 
 Float32 = NDArray[np.float32]
@@ -41,11 +50,13 @@ class RenderedFrame:
     image: UInt8
     """(H, W, 3) sRGB."""
     label: UInt8 | None
-    """(H, W) train ids, 255 where the surface cannot be seen; None where nobody labelled it."""
+    """(H, W) train ids, by `RenderOptions.labels` 255 where the surface cannot be seen; None where
+    nobody labelled it."""
     label_full: UInt8 | None
     """(H, W) train ids of the clear frame."""
     invalid: UInt8
-    """(H, W), 1 where the surface is undetectable or beyond the optical range; the sky is none."""
+    """(H, W), 1 where the surface is undetectable, or small and beyond the optical range, or under
+    so much snow that it cannot be told; of the sky where what stood before it has vanished."""
     transmittance: Float32
     """(H, W) share of the surface's light that reaches the pixel, in [0, 1]."""
     frame: Frame
@@ -57,6 +68,18 @@ class RenderedFrame:
     def depth(self) -> Float32:
         """(H, W) z-depth of the surface, metres, `inf` for the sky; read on first use."""
         return depth_of(surface_of(self.frame), self.window)
+
+    @cached_property
+    def loss_weight(self) -> Float32:
+        """(H, W) in [0, 1], how much a loss should count each pixel; see `loss_weight_of`.
+
+        0 where the label is 255 because of the weather, rising with the transmittance; computed on
+        first use.
+        """
+        if self.label is None or self.label_full is None:
+            return loss_weight_of(self.transmittance, self.invalid, np.isinf(self.depth), None)
+        lost = self.label != self.label_full
+        return loss_weight_of(self.transmittance, self.invalid, self.label_full == SKY, lost)
 
 
 def render(
@@ -122,7 +145,7 @@ def render(
         here = frame.camera.world_from_camera
         stage = Stage(surface, outer, frame.camera, weather, ambience, seed, air, options)
         shot = stage.published(rig or RigMotion(here, here), frame.time_s)
-        return _trimmed(shot, None, frame, outer, window)
+        return _trimmed(shot, None, frame, outer, window, weather, options)
     outer = window_taken(outer, frame.camera, options)
     surface = background_of(frame, weather, ambience, outer, layers, options)
     camera = camera_in(frame.camera, weather, options)
@@ -131,7 +154,8 @@ def render(
     traffic = traffic_of(frame, weather, ambience, seed, options)
     shot = stage.shaded(fields, shelter, frame.time_s, traffic.spray(air))
     photo = taken(traffic.lit(shot.image, outer, fields), frame, stage, fields, layers)
-    return _trimmed(shot._replace(image=photo.image), photo.glass, frame, outer, window)
+    shot = shot._replace(image=photo.image)
+    return _trimmed(shot, photo.glass, frame, outer, window, weather, options)
 
 
 def warm_up() -> None:
@@ -155,6 +179,9 @@ def warm_up() -> None:
     storm = replace(both, wipers=1.0, lens_drops=500.0)
     roof = Shelter(np.full((8, 8), 3.0, np.float32), np.array([-2.0, -2.0, -5.0]), axes)
     patchy = Weather(visibility_m=50.0, fog_patchiness=0.5, fog_puffs=0.2)
+    deep = Weather(visibility_m=18.0, snow_cover=1.0, road_snow_cover=1.0, snow_depth_m=0.2)
+    label[:, 8:] = SIDEWALK
+    label[2:4, :] = TRAIN_ID["traffic sign"]
     for dtype, known in ((np.float16, label), (np.float32, None)):
         frame = Frame(
             FrameKey(0, "warm-up"), 0.0, camera, image, known, depth.astype(dtype), boxes=(car,)
@@ -163,6 +190,7 @@ def warm_up() -> None:
             moment = replace(frame, time_s=time_s)
             render(moment, storm, seed=0, ambience=ambience, shelter=roof)
         render(frame, patchy, seed=0, ambience=ambience)
+        render(frame, deep, seed=0, ambience=ambience)
 
 
 def _wiping_s(weather: Weather, camera: Camera) -> tuple[float, float]:
@@ -203,44 +231,71 @@ def _with_margin(window: Window, margin: int, height: int, width: int) -> Window
 
 def _margin_px(frame: Frame, options: RenderOptions) -> int:
     """How far around a pixel its label and colour depend on the picture."""
-    margin = NEIGHBOURHOOD_PX // 2
+    margin = MARGIN_PX
     if options.multiple_scattering:
         margin += scattering_margin_px(max(frame.camera.focal_px), math.inf)
     return margin
 
 
 def _seen(frame: Frame, window: Window) -> UInt8:
-    """Train ids of a window; where nobody labelled, the sky is what is endlessly far."""
+    """Train ids of a window; where nobody labelled, endlessly far is the sky and the rest 255."""
     if frame.label is None:
         far = np.isinf(depth_of(surface_of(frame), window))
-        return np.where(far, np.uint8(SKY), np.uint8(0))
+        return np.where(far, np.uint8(SKY), np.uint8(IGNORE))
     # A copy, because the kernel would be compiled once more for what may not be written.
     return np.array(frame.label[_part(window)], order="C")
 
 
 def _trimmed(
-    shot: Planes, glass: Glass | None, frame: Frame, outer: Window, window: Window
+    shot: Planes,
+    glass: Glass | None,
+    frame: Frame,
+    outer: Window,
+    window: Window,
+    weather: Weather,
+    options: RenderOptions,
 ) -> RenderedFrame:
     """Labels from the outer window, then everything cut to the inner one."""
+    through, covered = shot.transmittance, shot.covered
     if glass is not None:
-        through = shot.transmittance * (np.float32(1.0) - glass.alpha)
-        shot = shot._replace(transmittance=through, covered=shot.covered | glass.hidden)
+        through = through * (np.float32(1.0) - glass.alpha)
+        covered = covered | glass.hidden
     part = _part((window[0] - outer[0], window[1] - outer[1], *window[2:]))
     cut = np.ascontiguousarray
+    sight = Sight(*np.zeros((2, *window[2:]), np.uint8))
+    # Else all surfaces are bright enough behind the glass and none is hazy.
+    if shot.hazy_count or covered.any() or through.min() < DOUBTFUL_TRANSMITTANCE:
+        planes = readable_labels(
+            _seen(frame, outer),
+            shot.transmittance,
+            through,
+            shot.distinct,
+            covered,
+            small_things(frame, outer),
+        )
+        sight = Sight(*(cut(plane[part]) for plane in planes))
     full = None if frame.label is None else np.array(frame.label[_part(window)], order="C")
-    honest = None if full is None else full.copy()
-    invalid = np.zeros(window[2:], np.uint8)
-    if shot.hazy_count or shot.covered.any():
-        seen = _seen(frame, outer)
-        planes = readable_labels(seen, shot.transmittance, shot.distinct, shot.covered)
-        invalid = cut(planes[1][part])
-        honest = None if full is None else cut(planes[0][part])
+    honest = None
+    if full is not None:
+        sight = _under_snow(sight, frame, window, weather, options)
+        honest = kept_labels(full, sight.unseen, options.labels)
     return RenderedFrame(
         image=cut(shot.image[part]),
         label=honest,
         label_full=full,
-        invalid=invalid,
-        transmittance=cut(shot.transmittance[part]),
+        invalid=sight.invalid,
+        transmittance=cut(through[part]),
         frame=frame,
         window=window,
     )
+
+
+def _under_snow(
+    sight: Sight, frame: Frame, window: Window, weather: Weather, options: RenderOptions
+) -> Sight:
+    """What cannot be told because of the snow that lies, besides what cannot be seen."""
+    limits = snow_limits(weather, options)
+    if limits is None:
+        return sight
+    unseen = sight.unseen | buried_borders(frame, window, limits)
+    return Sight(unseen, sight.invalid | unseen | covered_faces(frame, window, limits))

@@ -1,6 +1,12 @@
-"""What a label may still claim: pixels whose surface the weather hides become ignore."""
+"""What a label may still claim: pixels whose surface the weather hides become ignore.
+
+Everything is read off the recorded label, the geometry and what the renderer knows of its light;
+nothing is ever read off the edited picture.
+"""
 
 from __future__ import annotations
+
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -8,10 +14,11 @@ from numpy.typing import NDArray
 
 from weather_aug._compiled import compiled
 from weather_aug.colour import LUMINANCE
-from weather_aug.taxonomy import IGNORE, SKY
+from weather_aug.taxonomy import IGNORE, SKY, TRAIN_ID
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
+LabelPolicy = Literal["ignore_unseen", "keep", "acdc"]
 
 LEAST_TRANSMITTANCE = 0.02
 """Less than this of a surface's light reaches the pixel: nobody can name it."""
@@ -20,41 +27,90 @@ DOUBTFUL_TRANSMITTANCE = 0.05
 LEAST_CONTRAST_LEVELS = 2.5
 """Largest difference within 7 x 7 pixels, in sRGB levels, that still cannot be seen."""
 NEIGHBOURHOOD_PX = 7
+MARGIN_PX = 2 * (NEIGHBOURHOOD_PX // 2)
+"""How far around a pixel its label depends on light: the sky on surfaces within 3 pixels, and
+those on what is distinct within 3 more."""
 HAZY_TRANSMITTANCE = 0.5
 """Above it a surface of the airlight's own colour counts as seen: the air is clear enough."""
+MOVING = tuple(
+    TRAIN_ID[name]
+    for name in ("person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle")
+)
+"""What a picture of the same place in clear weather, taken another day, does not show."""
+
+
+class Sight(NamedTuple):
+    """What can be seen of the surfaces."""
+
+    unseen: UInt8
+    """(H, W), 1 where the surface cannot be detected."""
+    invalid: UInt8
+    """(H, W), 1 there and where it is doubtful, as ACDC's mask."""
 
 
 def readable_labels(
-    label: UInt8, transmittance: Float32, distinct: UInt8, covered: UInt8
-) -> tuple[UInt8, UInt8]:
-    """Labels for training and the mask of unreadable pixels.
+    label: UInt8,
+    air: Float32,
+    transmittance: Float32,
+    distinct: UInt8,
+    covered: UInt8,
+    small: UInt8 | None = None,
+) -> Sight:
+    """Where surfaces can be seen through air, particles and glass.
+
+    The sky stays the sky, because it is what the airlight looks like; only where what stood at the
+    horizon has vanished, nobody can say where the sky began: within 3 pixels it is invalid. What
+    nobody labelled stands nowhere: its depth is often unknown, so it seems to vanish in any air.
 
     Args:
         label: (H, W) train ids of the clear frame.
-        transmittance: (H, W) share of the surface's light that reaches the pixel.
+        air: (H, W) share of the surface's light that comes through air and particles.
+        transmittance: (H, W) the same through the glass as well.
         distinct: (H, W), 1 where what is left of a surface's light differs visibly from the
             airlight (by `least_linear_contrast`); 0 on the sky.
-        covered: (H, W), 1 where a large particle hides the surface.
+        covered: (H, W), 1 where a large particle or what is on the glass hides the surface.
+        small: (H, W), 1 where a thing is so small that beyond the optical range it is invalid; if
+            None, all are.
 
-    Returns:
-        (H, W) train ids with 255 where the surface cannot be detected, and (H, W) uint8 with 1
-        where it is undetectable or beyond the optical range (as ACDC's invalid mask). The sky stays
-        the sky: it is what the airlight looks like.
+    Source:
+        docs/physics.md, labels: 2.5 levels of contrast within 7 x 7 pixels, 2 % of the light; ACDC
+        (Sakaridis et al. 2021) for the invalid mask.
     """
-    size = (NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX)
-    near_distinct = cv2.dilate(distinct, np.ones(size, np.uint8))
-    out, invalid = np.empty_like(label), np.empty_like(label)
+    near = np.ones((NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX), np.uint8)
     limits = (HAZY_TRANSMITTANCE, DOUBTFUL_TRANSMITTANCE, LEAST_TRANSMITTANCE)
-    inputs = (label, transmittance, near_distinct, covered)
-    read_labels(
-        *(plane.reshape(-1) for plane in inputs),
+    vanished, doubtful = np.empty_like(label), np.empty_like(label)
+    inputs = (label, air, transmittance, cv2.dilate(distinct, near))
+    count = read_labels(
+        *(np.ascontiguousarray(plane).reshape(-1) for plane in inputs),
         tuple(np.float32(limit) for limit in limits),
-        np.uint8(IGNORE),
         np.uint8(SKY),
-        out.reshape(-1),
-        invalid.reshape(-1),
+        vanished.reshape(-1),
+        doubtful.reshape(-1),
     )
-    return out, invalid
+    unseen = cv2.bitwise_or(vanished, covered)
+    if small is not None:
+        doubtful &= small
+    invalid = cv2.bitwise_or(unseen, doubtful)
+    if count:
+        gone = vanished & (label != IGNORE)
+        invalid |= cv2.dilate(gone, near) & (label == SKY)
+    return Sight(unseen, invalid)
+
+
+def kept_labels(label: UInt8, unseen: UInt8, policy: LabelPolicy) -> UInt8:
+    """Train ids (H, W) for training: what becomes of a label whose surface cannot be seen.
+
+    Args:
+        label: (H, W) train ids of the clear frame.
+        unseen: (H, W), 1 where the surface cannot be seen.
+        policy: See `RenderOptions.labels`.
+    """
+    lost = np.arange(256, dtype=np.uint8)
+    if policy == "ignore_unseen":
+        lost[:] = IGNORE
+    elif policy == "acdc":
+        lost[list(MOVING)] = IGNORE
+    return np.where(unseen != 0, cv2.LUT(label, lost), label)
 
 
 def least_linear_contrast(airlight: NDArray[np.floating]) -> float:
@@ -69,25 +125,29 @@ def least_linear_contrast(airlight: NDArray[np.floating]) -> float:
 
 
 @compiled
-def read_labels(label, through, near_distinct, covered, limits, ignore, sky_id, out, invalid):
-    """Labels and invalid mask by the rules of `readable_labels`; all arrays are (N,).
+def read_labels(label, air, through, near_distinct, limits, sky_id, vanished, doubtful):
+    """What has vanished and what is doubtful, by `readable_labels`; all arrays are (N,).
 
     Args:
         label: uint8 train ids.
-        through: float32 transmittance.
+        air: float32 transmittance of air and particles.
+        through: float32 transmittance of air, particles and glass.
         near_distinct: uint8, 1 where something distinct is near.
-        covered: uint8.
         limits: Transmittances below which a surface is hazy, doubtful, hidden.
-        ignore: Id of what cannot be seen.
         sky_id: Id of the sky.
-        out: uint8 out.
-        invalid: uint8 out.
+        vanished: uint8 out, 1 where a surface cannot be told from the air.
+        doubtful: uint8 out, 1 where a surface is beyond the optical range.
+
+    Returns:
+        Number of vanished surfaces.
     """
-    hazy, doubtful, hidden = limits
+    hazy, doubt, hidden = limits
+    count = np.int64(0)
     for i in range(label.shape[0]):
         t = through[i]
         surface = label[i] != sky_id
-        unseen = surface & ((t < hidden) | ((t < hazy) & (near_distinct[i] == 0)))
-        unseen = unseen | (covered[i] != 0)
-        out[i] = ignore if unseen else label[i]
-        invalid[i] = np.uint8(1) if unseen | (surface & (t < doubtful)) else np.uint8(0)
+        lost = surface & ((t < hidden) | ((air[i] < hazy) & (near_distinct[i] == 0)))
+        vanished[i] = np.uint8(1) if lost else np.uint8(0)
+        doubtful[i] = np.uint8(1) if surface & (t < doubt) else np.uint8(0)
+        count += np.int64(1) if lost else np.int64(0)
+    return count

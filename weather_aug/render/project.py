@@ -150,7 +150,9 @@ def _shape(p, optics, medium, resolved_depth, compensate, out):
         drawn = reach2 if reach2 > np.float32(0.0) else np.float32(0.0)
         aside = np.float32(0.5) * (parts - one)
         half_v = np.sqrt(drawn * c)
-        over = (drawn * np.sqrt(det) * parts > large_area) & (peak > np.float32(HIDING_ALPHA))
+        # The area within which it hides what is behind it.
+        hiding2 = two * log(peak * np.float32(1.0 / HIDING_ALPHA))
+        over = (hiding2 * np.sqrt(det) * parts > large_area) & (peak > np.float32(HIDING_ALPHA))
         tau = near_optical_depth(z, tx, ty, optics, medium, out[_CARRIED + k])
         out[_U + k] = optics.cx + optics.fx * tx
         out[_V + k] = optics.cy + optics.fy * ty

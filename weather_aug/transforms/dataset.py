@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,11 @@ from weather_aug._keys import check_seed, key_of, uniforms
 from weather_aug.clip.types import Window
 from weather_aug.errors import ArgumentError
 from weather_aug.render.compose import RenderedFrame, warm_up
+from weather_aug.render.label_weight import loss_weight_of
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene.policy import WeatherDraw, WeatherPolicy
 from weather_aug.scene.scene import WeatherScene
+from weather_aug.taxonomy import SKY
 
 Sample = dict[str, Any]
 
@@ -30,10 +33,11 @@ class WeatherDataset(Dataset[Any]):
         and another weather in another epoch. Call `set_epoch` between epochs; it reaches persistent
         workers too. Without `transform` an item is a dict of tensors: `image` (3, H, W) uint8 RGB,
         `label` (H, W) int64 train ids with 255 where the surface cannot be seen, `label_full`
-        (H, W) int64 train ids of the clear frame, `invalid` (H, W) uint8, 1 where the surface is
-        undetectable or beyond the optical range, `transmittance` in [0, 1] and `depth` in metres
+        (H, W) int64 train ids of the clear frame, `invalid` (H, W) uint8, 1 where the surface
+        cannot be made out (see `RenderedFrame`), `transmittance` in [0, 1] and `depth` in metres
         (H, W) float32, and `recipe`, a JSON text from which the item can be rendered again. Scenes
         without labels give items without `label` and `label_full`; all frames have labels, or none.
+        `loss_weight(item)` gives weights for a loss, of a batch as well.
 
     Args:
         scenes: One or more scenes.
@@ -152,6 +156,37 @@ class WeatherDataset(Dataset[Any]):
                         f"crop {self.crop} does not fit frame {key} of scene {scene.name} "
                         f"({height}x{width} pixels)"
                     )
+
+
+def loss_weight(sample: Mapping[str, Any]) -> Any:
+    """How much a loss should count each pixel of a sample, or of a collated batch of them.
+
+    Computed only where it is wanted, from planes that an item has anyway.
+
+    Args:
+        sample: With `transmittance`, `invalid`, and `label` and `label_full`, or `depth` where
+            nobody labelled; numpy arrays or torch tensors of (..., H, W).
+
+    Returns:
+        (..., H, W) float32 in [0, 1], 0 where the weather turned the label into 255; see
+        `RenderedFrame.loss_weight`.
+
+    Raises:
+        ArgumentError: If a plane is missing.
+    """
+    labelled = "label" in sample
+    planes = ("transmittance", "invalid", *(("label", "label_full") if labelled else ("depth",)))
+    for name in planes:
+        if name not in sample:
+            raise ArgumentError(
+                f"sample has no {name!r}; call loss_weight with an item of a WeatherDataset before "
+                "a transform drops its planes"
+            )
+    through, invalid = sample["transmittance"], sample["invalid"]
+    if not labelled:
+        return loss_weight_of(through, invalid, sample["depth"] == math.inf, None)
+    full = sample["label_full"]
+    return loss_weight_of(through, invalid, full == SKY, sample["label"] != full)
 
 
 def _checked_policy(policy: Any) -> WeatherPolicy:

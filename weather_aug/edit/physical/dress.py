@@ -92,7 +92,8 @@ def dress(
     cell = np.empty(width, np.uint32)
     share = np.empty(width, np.float32)
     _cells(left, width, step, columns, cell, share)
-    first_cell, last_cell = np.int64(cell[0]), min(np.int64(cell[width - 1]) + 2, columns)
+    first_cell = np.uint64(cell[0])
+    last_cell = np.uint64(min(np.int64(cell[width - 1]) + 2, columns))
     count, _ = knots_across(left, width, surface.width)
     knots = np.empty((2, count), np.float32)
     knot_depth = np.empty(count * KNOT_PX, np.float32)
@@ -134,7 +135,7 @@ def dress(
         if snowy or pools:
             noise_row(
                 *(surface, classes, y, left, width, geometry, table, tile),
-                *(pools, knots, knot_depth, b),
+                *((snowy, pools), knots, knot_depth, b),
             )
         if snowy or wet:
             x0 = 0

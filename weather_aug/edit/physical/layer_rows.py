@@ -17,7 +17,7 @@ def load_row(layers, cells, by_root, matrix, look, scratch, out):
 
     Args:
         layers: (20, h, w) uint16, bits of float16.
-        cells: (row, first, last) which to load.
+        cells: (row, first, last) which to load; the latter two unsigned, see `spread_run`.
         by_root: (1024,) float32 toned light by the square root of light.
         matrix: (3, 3) float32 colour matrix after the tone.
         look: Weather.

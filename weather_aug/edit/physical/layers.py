@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from weather_aug.colour import LUMINANCE, srgb_from_linear
+from weather_aug._rows import halves
+from weather_aug.colour import LUMINANCE
 from weather_aug.edit.physical import relight, settling
 from weather_aug.edit.physical.mirror import mirror_map, mirrored
 from weather_aug.edit.physical.overcast import ZENITH_GAIN
@@ -75,7 +76,7 @@ def layers_of(site: Site, path: Float64 | None = None) -> Layers:
     shown = mirrored(mirror, surfaces.astype(np.float32), np.zeros((2, 3)))
     sky_gain = np.array([[1.0] * 3, [1.0 + ZENITH_GAIN] * 3])
     free = mirrored(mirror, np.zeros_like(site.light), sky_gain)
-    luminance = (site.light @ LUMINANCE).astype(np.float32)
+    luminance = site.light @ LUMINANCE.astype(np.float32)
     planes = (
         *np.moveaxis(flat.ground, -1, 0),
         *np.moveaxis(flat.objects, -1, 0),
@@ -89,14 +90,14 @@ def layers_of(site: Site, path: Float64 | None = None) -> Layers:
         *np.moveaxis(shown.rough, -1, 0),
         free.rough[..., 0],
     )
-    stack = np.stack(planes).astype(np.float16)
+    stack = halves(np.stack(planes))
     stack.flags.writeable = False
     return Layers(float(site.step), stack, flat.tint, site.plane, site.classes)
 
 
 def overcast_light(site: Site, flat: relight.Flattening) -> Float32:
     """Linear light (h, w, 3) of what stands, without the sun's."""
-    luma = srgb_from_linear(np.clip(site.light, 0, 1)) @ LUMINANCE
+    luma = site.srgb @ LUMINANCE.astype(np.float32)
     slope, offset = flat.objects[..., 0], flat.objects[..., 1]
     gain = np.clip(slope * luma + offset, relight.LEAST_GAIN, relight.MOST_GAIN)
     return (site.light * np.exp(gain)[..., None]).astype(np.float32)

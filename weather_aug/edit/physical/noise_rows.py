@@ -32,7 +32,7 @@ def knots_across(left, width, whole_width):
 
 
 @compiled
-def noise_row(surface, classes, y, left, width, geometry, table, tile, pools, knots, depth, b):
+def noise_row(surface, classes, y, left, width, geometry, table, tile, wanted, knots, depth, b):
     """Noise of one row's places, and the water's where `pools`.
 
     Args:
@@ -44,11 +44,12 @@ def noise_row(surface, classes, y, left, width, geometry, table, tile, pools, kn
         geometry: Of the whole picture.
         table: Materials.
         tile: Noise.
-        pools: Whether the water's noise is wanted.
+        wanted: (snow's, water's) noise.
         knots: (2, K) float32 scratch.
         depth: (>= 4 K) float32 scratch.
-        b: Buffer; fills NOISE and LIE.
+        b: Buffer; fills NOISE, with 1/2 if it is not wanted, and LIE.
     """
+    snow, pools = wanted
     count, first = knots_across(left, width, surface.width)
     wide = min(count * KNOT_PX, surface.width - first)
     row_depth = depth[:wide]
@@ -78,7 +79,9 @@ def noise_row(surface, classes, y, left, width, geometry, table, tile, pools, kn
             along += slope
             aside += slope
             size *= np.float32(KNOT_PX)
-        knots[0, k] = ground_noise(tile, along, aside, size, np.float32(0.0))
+        knots[0, k] = np.float32(0.5)
+        if snow:
+            knots[0, k] = ground_noise(tile, along, aside, size, np.float32(0.0))
         if pools:
             knots[1, k] = ground_noise(tile, along, aside, size, np.float32(OTHER_M))
     _between(knots, 0, left - first, width, b, NOISE)

@@ -27,6 +27,7 @@ from weather_aug.edit.physical.ground_rows import (
     MICRO_SLOPE,
     POOL_DARKENING,
     RUT_WATER,
+    SHARPEST,
     SHOWING_THROUGH,
     SLUSH,
     SNOW_ALBEDO,
@@ -83,7 +84,7 @@ def dressed_ground(
     (lateral_m,) = grid.at(LATERAL_M, 1, pixels)
     tracks = torch.where(road, look.tracks * tracks_at(lateral_m, pixels.noise), 0.0)
     if look.film > 0:
-        light = film(light, lit, look.film * material[:, POROSITY])
+        light = film(light, look.exposure * lit.clamp(min=0.02), look.film * material[:, POROSITY])
     if look.mirror > 0:
         pools = torch.where(road, look.puddles * (1.0 + RUT_WATER * tracks), 0.0)
         pool = covered(pools, _fuzz(places.size_m), pixels.lie)
@@ -99,7 +100,7 @@ def dressed_ground(
         softness = torch.where(road, TRACK_SOFTNESS, 0.0).to(lit.dtype)
         cover = covered(left, _fuzz(places.size_m) + softness, pixels.noise)
         least = torch.where(road, SLUSH, CLEAN).to(lit.dtype)
-        under = (luminance(light) / (ASPHALT_ALBEDO * lit)).clamp(max=2.0)
+        under = (luminance(light) / (ASPHALT_ALBEDO * look.exposure * lit)).clamp(max=2.0)
         shade = (least + (LIGHTEST - least) * pixels.noise) * (
             1.0 - SHOWING_THROUGH + SHOWING_THROUGH * under
         )
@@ -114,9 +115,13 @@ def ramp(low: float | Tensor, high: float | Tensor, value: Tensor) -> Tensor:
 
 
 def covered(amount: Tensor, fuzz: float | Tensor, noise: Tensor) -> Tensor:
-    """How far a place of this noise is covered when a share `amount` of all places is."""
-    threshold = 1.0 + fuzz - amount * (1.0 + 2.0 * fuzz)
-    return ramp(threshold - fuzz, threshold + fuzz, noise)
+    """How far a place of this noise is covered when a share `amount` of all places is.
+
+    `fuzz` is how soft borders are; it gives way where a border would leave the noise's range.
+    """
+    soft = torch.minimum(amount, 1.0 - amount).clamp(max=fuzz).clamp(min=SHARPEST)
+    threshold = 1.0 + SHARPEST - amount * (1.0 + 2.0 * SHARPEST)
+    return ramp(threshold - soft, threshold + soft, noise)
 
 
 def _fuzz(size_m: Tensor) -> Tensor:
@@ -147,9 +152,9 @@ def tracks_at(lateral_m: Tensor, noise: Tensor) -> Tensor:
     return track * (1.0 - OTHER_LANES_LESS * lane.abs()).clamp(min=0.0)
 
 
-def film(light: Tensor, lit: Tensor, wet: Tensor) -> Tensor:
-    """Light (3, N) under a film of water, `wet` (N,) of it; `lit` (N,) is the light on it."""
-    albedo = (light / lit.clamp(min=0.02)).clamp(0.01, 0.95)
+def film(light: Tensor, white: Tensor, wet: Tensor) -> Tensor:
+    """Light (3, N) under a film of water, `wet` (N,) of it; `white` (N,) is a white surface's."""
+    albedo = (light / white).clamp(0.01, 0.95)
     passes = (1.0 - DIFFUSE_FROM_AIR) * (1.0 - DIFFUSE_FROM_WATER)
     ratio = passes / (1.0 - DIFFUSE_FROM_WATER * albedo)
     return light * (1.0 + wet * (ratio - 1.0))

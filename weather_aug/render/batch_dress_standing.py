@@ -55,7 +55,8 @@ def holds_snow(material: Tensor) -> Tensor:
 def wet_standing(light: Tensor, pixels: Pixels, grid: Grid, look: SimpleNamespace) -> Tensor:
     """Light (3, N) of wet walls, trunks and clothes."""
     (lit,) = grid.at(ILLUMINATION, 1, pixels)
-    return film(light, lit, look.film * pixels.material[:, POROSITY])
+    white = look.exposure * lit.clamp(min=0.02)
+    return film(light, white, look.film * pixels.material[:, POROSITY])
 
 
 def snowed_standing(
@@ -82,8 +83,9 @@ def snowed_standing(
     z, material, noise = pixels.depth_m, pixels.material, pixels.noise
     lit, mean, facing_up = grid.at(ILLUMINATION, 3, pixels)
     climb = pixels.towards(geometry.climb_x, geometry.climb_y, geometry.climb_z)
-    # Farther off nothing is buried; endless depth times a level view would be no number.
+    # Endless depth times a level view would be no number.
     height_m = geometry.height_0 + z.clamp(max=BURIED_RANGE_M) * climb
+    height_m = torch.where(z < BURIED_RANGE_M, height_m, NO_CAP_M)
     size_m = (z / geometry.fy).clamp(max=1.0)
     lit = lit.clamp(min=0.02)
     amount = look.snow * material[:, COVER]
@@ -94,8 +96,9 @@ def snowed_standing(
         _on_leaves(brightness, amount, noise),
         _on_edges(below_m, facing_up, amount, size_m, noise, material, look),
     )
-    buried = (height_m < look.snow_depth_m * (0.6 + 0.8 * noise)) & (z < BURIED_RANGE_M)
-    foot = torch.where(buried, look.snow * material[:, BURIED], 0.0)
+    buried_m = look.snow_depth_m * (0.6 + 0.8 * noise)
+    lies = 1.0 - ramp(0.7 * buried_m, 1.1 * buried_m + 1e-6, height_m)
+    foot = look.snow * material[:, BURIED] * lies
     bright = snow_light(lit, look) * (0.81 + 0.11 * noise)
     shaded = torch.where(leaf, (0.25 + 4.0 * mean / lit).clamp(max=0.85), 1.0)
     return laid(light, torch.maximum(cover, foot), bright * shaded, look)
@@ -117,8 +120,8 @@ def _on_edges(
     look: SimpleNamespace,
 ) -> Tensor:
     """Cover of a cap on the upper edge and of level parts."""
-    edge_m = look.snow * material[:, CAP_M] * (0.6 + 0.8 * noise) + 0.4 * look.snow_depth_m + 1e-6
-    cap = 1.0 - ramp(0.7 * edge_m, 1.2 * edge_m, below_m)
+    edge_m = look.snow * material[:, CAP_M] * (0.6 + 0.8 * noise) + 0.4 * look.snow_depth_m
+    cap = ((edge_m - below_m) / size_m.clamp(min=1e-5)).clamp(0.0, 1.0)
     level = ramp(0.55, 0.85, facing_up)
     lies = covered(amount * level, 0.07 + 0.25 * size_m, noise)
     return torch.where(material[:, LEVEL] > 0, torch.maximum(cap, lies), cap)

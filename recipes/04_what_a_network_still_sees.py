@@ -21,8 +21,8 @@ from weather_aug.clip.labelled import Teacher
 from weather_aug.errors import ArgumentError, MissingExtraError
 from weather_aug.scene.policy import TYPES, weather_of
 from weather_aug.scores.agreement import Agreement, agreement
+from weather_aug.severity import NAMED_SEVERITIES
 from weather_aug.taxonomy import SKY
-from weather_aug.weather import NAMED_SEVERITIES
 
 NONE = Agreement(np.zeros((19, 19), np.int64))
 RISE, STEP = 0.01, 0.7

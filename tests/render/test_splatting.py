@@ -240,7 +240,7 @@ def test_wind_blows_to_the_left_of_the_street(ambience):
 
 def test_large_near_flakes_cover_the_label(ambience):
     """In a snowstorm some flake hides a thousandth of a small picture: its middle is ignored."""
-    camera = make_camera(320, 240, 300.0, exposure_s=0.0005, aperture_m=0.0)
+    camera = make_camera(320, 240, 900.0, exposure_s=0.0005, aperture_m=0.0)
     label = np.zeros((240, 320), np.uint8)
     covered = 0
     for seed in range(40):

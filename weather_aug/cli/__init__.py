@@ -63,7 +63,7 @@ class Build:
 
 @dataclass(frozen=True)
 class Sweep:
-    """Make one labelled picture of all weathers and severities."""
+    """Make one labelled picture of all weathers and severities, or of four states."""
 
     scene: Positional[Path]
     """Scene folder."""
@@ -77,13 +77,20 @@ class Sweep:
     """Which particles fall."""
     tile_width: int = 480
     """Width of each picture, pixels."""
+    states: bool = False
+    """Show a wet road without rain, fresh snow under clear air, dense fog with lamps, and heavy
+    rain through wet glass instead."""
+    without: tuple[str, ...] = ()
+    """Effects to leave out, such as mirror lamps drops; see `RenderOptions.without`."""
 
     def run(self) -> None:
         """Render the grid and name its file."""
         from weather_aug.clip.types import FrameKey
+        from weather_aug.render.options import RenderOptions
         from weather_aug.scene.scene import WeatherScene
-        from weather_aug.view.sheet import sweep, write_png
+        from weather_aug.view.sheet import states, sweep, write_png
 
+        options = RenderOptions(without=self.without)
         scene = WeatherScene.load(self.scene)
         camera = self.camera or scene.cameras[0]
         times = [k.time_index for k in scene.keys if k.camera == camera]
@@ -94,7 +101,9 @@ class Sweep:
             )
         time_index = times[len(times) // 2] if self.time is None else self.time
         key = FrameKey(time_index, camera)
-        write_png(self.out, sweep(scene, key, seed=self.seed, tile_width=self.tile_width))
+        draw = states if self.states else sweep
+        sheet = draw(scene, key, seed=self.seed, tile_width=self.tile_width, options=options)
+        write_png(self.out, sheet)
         say(str(self.out))
 
 
@@ -174,7 +183,7 @@ class Demo:
         from weather_aug.clip.open import open_clip
         from weather_aug.scene.scene import WeatherScene
         from weather_aug.transforms.dataset import WeatherDataset
-        from weather_aug.view.sheet import contact_sheet, write_png
+        from weather_aug.view.sheet import contact_sheet, states, write_png
 
         start = time.perf_counter()
         low, high = DEMO_WIDTH_PX
@@ -193,12 +202,15 @@ class Demo:
             sample = dataset[index]
             ignored = (sample["label"] == IGNORE).float().mean()
             say(f"    {_state(sample['recipe'])}; {ignored:.1%} of the label ignored")
-        say("3/3 render rain, snow and fog at three severities")
+        say("3/3 render four states of the street, then rain, snow and fog by severity")
         middle = scene.keys[len(scene.keys) // 2].time_index
         keys = [key for key in scene.keys if key.time_index == middle]
+        front = next(key for key in keys if key.camera == "front")
+        write_png(self.out / "states.png", states(scene, front))
         sheet = self.out / "contact_sheet.png"
         write_png(sheet, contact_sheet(scene, keys))
         say(f"done in {time.perf_counter() - start:.0f} s; look at")
+        say(str(self.out / "states.png"))
         say(str(sheet))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from weather_aug._compiled import compiled
@@ -46,3 +48,28 @@ def encode_row(light, out):
         p = np.float32(-0.0401096) + s * p
         p = p if v > np.float32(0.0031308) else np.float32(12.92) * v
         out[x] = np.uint8(np.int32(p * np.float32(255.0) + np.float32(0.5)))
+
+
+def halves(values: Any) -> Any:
+    """float16 of finite float32 `values`, rounded as numpy does, several times as fast.
+
+    What float16 cannot hold becomes its largest number, and what it holds with fewer digits (below
+    6e-5) becomes 0.
+    """
+    values = np.ascontiguousarray(values, np.float32)
+    out = np.empty(values.shape, np.uint16)
+    _halve(values.reshape(-1).view(np.int32), out.reshape(-1))
+    return out.view(np.float16)
+
+
+@compiled
+def _halve(bits, out):
+    """The exponent's bias moves by 112; then the mantissa is cut, ties to even."""
+    least, largest = np.int32(0x38800000), np.int32(0x477FE000)
+    for i in range(bits.shape[0]):
+        size = bits[i] & np.int32(0x7FFFFFFF)
+        word = min(size, largest) - np.int32(0x38000000)
+        word = (word + np.int32(0xFFF) + ((word >> np.int32(13)) & np.int32(1))) >> np.int32(13)
+        word = word if size >= least else np.int32(0)
+        sign = (bits[i] >> np.int32(16)) & np.int32(0x8000)
+        out[i] = np.uint16(word | sign)

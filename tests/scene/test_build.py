@@ -19,6 +19,7 @@ from tiny_clip import TinyClip, digests_of
 from weather_aug import _files
 from weather_aug.clip.types import Box, Float64, Frame, FrameKey
 from weather_aug.edit.ambience import ambience_of
+from weather_aug.edit.physical.layers import Layers
 from weather_aug.errors import (
     ArgumentError,
     ClipError,
@@ -29,6 +30,7 @@ from weather_aug.errors import (
 )
 from weather_aug.scene import build as building
 from weather_aug.scene import store
+from weather_aug.scene.layers import Street
 from weather_aug.scene.scene import WeatherScene
 
 WORK = ".building"
@@ -455,6 +457,126 @@ def test_a_build_of_another_process_is_continued(tiny_scene: WeatherScene, out: 
     assert len(journal.splitlines()) == 7
 
 
+# The second round
+
+
+def interrupt_second(out: Path, index: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cut a build when it looks at its `index`-th frame."""
+    seen = building.layers_seen
+    key = TinyClip().keys[index]
+
+    def cut(frame: Frame, street: Street) -> Layers:
+        if frame.key == key:
+            raise RuntimeError("power cut")
+        return seen(frame, street)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(building, "layers_seen", cut)
+        with pytest.raises(RuntimeError, match="power cut"):
+            WeatherScene.build(TinyClip(), out)
+    assert not out.exists()
+
+
+def looked(monkeypatch: pytest.MonkeyPatch) -> list[FrameKey]:
+    """Keys of the frames that are looked at from now on."""
+    keys: list[FrameKey] = []
+    seen = building.layers_seen
+
+    def noted(frame: Frame, street: Street) -> Layers:
+        keys.append(frame.key)
+        return seen(frame, street)
+
+    monkeypatch.setattr(building, "layers_seen", noted)
+    return keys
+
+
+@pytest.mark.parametrize("index", [0, 1, 5, 7])
+def test_an_interrupted_second_round_is_continued(
+    tiny_scene: WeatherScene, out: Path, index: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupt_second(out, index, monkeypatch)
+    again, found = Watched(), looked(monkeypatch)
+    WeatherScene.build(again, out)
+    keys = TinyClip().keys
+    assert again.read == [keys[0]]
+    assert found == [*keys[: min(index, 1)], *keys[index:]]
+    assert digests_of(out) == digests_of(tiny_scene.path)
+    assert list(out.parent.iterdir()) == [out]
+
+
+@pytest.mark.parametrize("part", ["layers", "small"])
+def test_a_spoilt_layer_costs_one_frame(
+    tiny_scene: WeatherScene, out: Path, part: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupt_second(out, 6, monkeypatch)
+    keys = TinyClip().keys
+    path = out.with_name(out.name + WORK) / store.part_path(keys[2], part)
+    path.write_bytes(path.read_bytes()[:-1])
+    found = looked(monkeypatch)
+    WeatherScene.build(TinyClip(), out)
+    assert found == [keys[0], keys[2], *keys[6:]]
+    assert digests_of(out) == digests_of(tiny_scene.path)
+
+
+def test_layers_of_another_look_are_thrown_away(
+    tiny_scene: WeatherScene, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A planted fault: the editor looked at frames otherwise when the work was cut."""
+    seen = building.layers_seen
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            building,
+            "layers_seen",
+            lambda frame, street: seen(frame, street._replace(route=None, camera_height_m=2.0)),
+        )
+        interrupt_second(out, 6, patch)
+    stray = out.with_name(out.name + WORK) / store.part_path(TinyClip().keys[0], "classes")
+    stray.write_bytes(b"left over")
+    found = looked(monkeypatch)
+    WeatherScene.build(TinyClip(), out)
+    assert found == [TinyClip().keys[0], *TinyClip().keys]
+    assert digests_of(out) == digests_of(tiny_scene.path)
+
+
+def test_layers_belong_to_all_frames(
+    tiny_scene: WeatherScene, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The way driven is the whole drive's; layers of another drive's first frames are none of it.
+
+    The first frames are alike, so that only the digest of all can tell.
+    """
+    interrupt_second(out, 6, monkeypatch)
+    work = out.with_name(out.name + WORK)
+    journal = work / building.LAYERS_JOURNAL
+    lines = journal.read_text().splitlines()
+    journal.write_text("\n".join(['{"layers": "of another drive"}', *lines[1:]]) + "\n")
+    found = looked(monkeypatch)
+    WeatherScene.build(TinyClip(), out)
+    assert found == list(TinyClip().keys)
+    assert digests_of(out) == digests_of(tiny_scene.path)
+
+
+def test_a_full_disk_in_the_second_round_keeps_the_work(
+    out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = _files.write_whole
+
+    def full(path: Path, data: bytes) -> None:
+        if path.name == "000001_front.small.npy":
+            with _files.reported(path):
+                raise OSError(28, "No space left on device")
+        whole(path, data)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(_files, "write_whole", full)
+        with pytest.raises(OutputError, match="free some space"):
+            WeatherScene.build(TinyClip(frames=2), out)
+    assert not out.exists()
+    again = Watched(TinyClip(frames=2))
+    assert WeatherScene.build(again, out).damaged_files() == []
+    assert again.read == [TinyClip().keys[0]]
+
+
 def _cut_journal(work: Path) -> None:
     text = (work / building.JOURNAL).read_text()
     (work / building.JOURNAL).write_text(text[: len(text) - 40])
@@ -587,7 +709,7 @@ print(calls)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("last", range(1, 60, 2))
+@pytest.mark.parametrize("last", range(1, 110, 3))
 def test_a_build_killed_at_any_write_is_continued(out: Path, last: int) -> None:
     code = _KILLED_ANYWHERE.format(tests=str(Path(__file__).parents[1]), out=str(out), last=last)
     subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, timeout=60)

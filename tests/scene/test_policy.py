@@ -13,8 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
+from weather_aug._keys import uniforms
 from weather_aug.errors import ArgumentError
-from weather_aug.scene.policy import WeatherDraw, WeatherPolicy, weather_of
+from weather_aug.scene.policy import VARIED, WeatherDraw, WeatherPolicy, weather_of
 from weather_aug.weather import Weather
 
 ITEMS = 20_000
@@ -43,10 +44,96 @@ def test_types_come_by_their_weights(draws: list[WeatherDraw]) -> None:
 
 
 @pytest.mark.parametrize("kind", TYPES)
-def test_severity_is_even_over_its_range_in_each_type(draws: list[WeatherDraw], kind: str) -> None:
+def test_severity_is_triangular_with_moderate_the_commonest(
+    draws: list[WeatherDraw], kind: str
+) -> None:
     severity = np.array([draw.severity for draw in draws if draw.kind == kind])
     assert 0.2 <= severity.min() < severity.max() <= 0.9
-    assert stats.kstest(severity, "uniform", (0.2, 0.7)).pvalue >= LEAST_P
+    peak = (0.5 - 0.2) / 0.7
+    assert stats.kstest(severity, "triang", (peak, 0.2, 0.7)).pvalue >= LEAST_P
+    assert stats.kstest(severity, "uniform", (0.2, 0.7)).pvalue < LEAST_P, "a planted fault"
+
+
+@pytest.mark.parametrize(("low", "high", "peak"), [(0.6, 1.0, 0.0), (0.0, 0.3, 1.0)])
+def test_severity_leans_to_moderate_from_outside(low: float, high: float, peak: float) -> None:
+    policy = WeatherPolicy({"fog": 1.0}, severity=(low, high))
+    severity = [policy.draw(2, 0, item).severity for item in range(3_000)]
+    assert stats.kstest(severity, "triang", (peak, low, high - low)).pvalue >= LEAST_P
+
+
+# Days of equal severity
+
+
+def factors(policy: WeatherPolicy, count: int = 4_000) -> dict[str, np.ndarray[Any, Any]]:
+    """What each varied value of heavy snow and rain is of the severity's own."""
+    usual = Weather.mix(Weather.rain(0.25), Weather.snow(0.25))
+    drawn = [policy.draw(9, 0, item).weather for item in range(count)]
+    return {
+        name: np.array([getattr(w, name) for w in drawn]) / getattr(usual, name) for name in VARIED
+    }
+
+
+LIGHT_DAYS = {"types": {"rain+snow": 1.0}, "severity": (0.25, 0.25), "falling": 1.0}
+
+
+def test_days_differ_within_the_documented_ranges() -> None:
+    usual = Weather.mix(Weather.rain(0.25), Weather.snow(0.25))
+    for name, factor in factors(WeatherPolicy(**LIGHT_DAYS)).items():
+        least, greatest, most = VARIED[name]
+        cut = most / getattr(usual, name)
+        assert least - 1e-9 <= factor.min() and factor.max() <= min(greatest, cut) + 1e-9, name
+        whole = factor[factor < cut - 1e-9]
+        law = (least, min(greatest, cut) - least)
+        assert stats.kstest(whole, "uniform", law).pvalue >= LEAST_P, name
+
+
+def independent(found: dict[str, np.ndarray[Any, Any]]) -> bool:
+    table = np.corrcoef(np.array(list(found.values())))
+    count = len(next(iter(found.values())))
+    return bool((np.abs(table - np.eye(len(table))) <= 4.5 / math.sqrt(count)).all())
+
+
+def test_what_varies_does_not_know_of_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = WeatherPolicy(**LIGHT_DAYS)
+    assert independent(factors(policy))
+
+    def one_for_all(key: int, count: int) -> Any:
+        return np.full(count, uniforms(key, 1)[0])
+
+    monkeypatch.setattr("weather_aug.scene.policy.uniforms", one_for_all)
+    assert not independent(factors(policy)), "a planted fault is not told"
+
+
+def test_a_day_says_nothing_of_its_severity() -> None:
+    policy = WeatherPolicy({"rain": 1.0}, falling=1.0)
+    drawn = [policy.draw(3, 0, item) for item in range(4_000)]
+    drops = [d.weather.lens_drops / Weather.rain(d.severity).lens_drops for d in drawn]
+    correlation = np.corrcoef(drops, [d.severity for d in drawn])[0, 1]
+    assert abs(correlation) <= 4.5 / math.sqrt(len(drawn))
+
+
+def test_variation_narrows_the_ranges() -> None:
+    half = factors(WeatherPolicy(**LIGHT_DAYS, variation=0.5), 1_000)
+    assert half["puddles"].min() >= 0.5
+    assert half["puddles"].max() <= 2.5
+    none = factors(WeatherPolicy(**LIGHT_DAYS, variation=0.0), 10)
+    assert all((factor == 1).all() for factor in none.values())
+
+
+def test_a_quarter_of_the_default_stays_clear_to_the_last_bit() -> None:
+    drawn = [WeatherPolicy().draw(1, 0, item) for item in range(8_000)]
+    clear = [draw for draw in drawn if draw.kind == "clear"]
+    assert stats.binomtest(len(clear), len(drawn), 0.25).pvalue >= LEAST_P
+    assert all(draw.weather.is_clear for draw in clear)
+    assert not any(draw.weather.is_clear for draw in drawn if draw.kind != "clear")
+
+
+def test_nothing_that_ended_comes_back() -> None:
+    policy = WeatherPolicy({"rain": 1.0, "snow": 1.0}, falling=0.0)
+    for item in range(300):
+        weather = policy.draw(0, 0, item).weather
+        assert weather.lens_drops == weather.wipers == weather.rain_mm_per_h == 0
+        assert weather.wetness > 0
 
 
 @pytest.mark.parametrize("kind", FALLS)
@@ -112,7 +199,7 @@ def test_a_plus_is_both_at_once() -> None:
 @pytest.mark.parametrize("kind", ["rain", "snow", "fog"])
 def test_a_single_type_is_drawn_to_the_last_bit(kind: str) -> None:
     """Nothing is mixed into it, so that a recipe shows the numbers that were asked for."""
-    draw = WeatherPolicy({kind: 1.0}, falling=1.0).draw(1, 2, 3)
+    draw = WeatherPolicy({kind: 1.0}, falling=1.0, variation=0.0).draw(1, 2, 3)
     expected = weather_of(kind, draw.severity).to_dict()
     assert expected | {"wind_m_per_s": None} == draw.weather.to_dict() | {"wind_m_per_s": None}
 
@@ -133,7 +220,7 @@ def test_a_weight_of_zero_is_never_drawn() -> None:
 def test_a_dict_gives_an_equal_policy_back(
     weights: dict[str, float], severity: tuple[float, float], falling: float
 ) -> None:
-    policy = WeatherPolicy(weights, (min(severity), max(severity)), falling)
+    policy = WeatherPolicy(weights, (min(severity), max(severity)), falling, falling / 2)
     assert WeatherPolicy.from_dict(policy.to_dict()) == policy
     assert WeatherPolicy.from_dict({}) == WeatherPolicy()
 
@@ -173,6 +260,8 @@ def test_a_callers_dict_is_copied() -> None:
         ({"severity": None}, "severity must be a range"),
         ({"falling": 1.1}, "falling"),
         ({"falling": True}, "falling"),
+        ({"variation": 1.1}, "variation"),
+        ({"variation": None}, "variation"),
         ({"wetness": 1}, "no field wetness"),
     ],
     ids=str,

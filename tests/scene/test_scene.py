@@ -148,7 +148,8 @@ def test_the_light_is_the_frames_own_and_the_airlight_the_clips(tiny_scene: Weat
             assert getattr(ambience, name).tolist() == getattr(expected, name).tolist()
         assert ambience.airlight.tolist() == airlight
         frame, weather = tiny_scene.frame(key), WEATHERS["all"]
-        by_hand = render(frame, weather, seed=1, ambience=ambience)
+        layers = tiny_scene.layers(key)
+        by_hand = render(frame, weather, seed=1, ambience=ambience, layers=layers)
         assert_same(by_hand, tiny_scene.render(key, weather, seed=1))
 
 

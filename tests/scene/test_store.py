@@ -266,7 +266,12 @@ def test_the_longest_manifest_opens_under_its_own_limit(tiny_clip: TinyClip) -> 
         entry[field] = np.full(3, longest).tolist()
     for field in ("time_s", "exposure_s", "aperture_m"):
         entry[field] = longest
+    numbers = {"tint": [longest] * 3, "plane": [longest] * 3, "illumination": longest}
+    entry["layers"] = {"step": 12, **numbers}
     file = {"size": 10**9, "sha256": "f" * 64}
+    parts = ("image", "depth", "label", "boxes", "layers", "small", "classes")
+    key = FrameKey(store.MAX_FRAMES, name)
+    entry["files"] = {part: store.part_path(key, part) for part in parts}
     files = {path: file for path in entry["files"].values()}
     empty = len(store.manifest_bytes({"frames": [], "files": {}}))
     each = len(store.manifest_bytes({"frames": [entry], "files": files})) - empty

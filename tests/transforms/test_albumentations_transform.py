@@ -17,6 +17,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from weather_aug.clip.types import Camera, FrameKey
 from weather_aug.errors import ArgumentError, DataError
+from weather_aug.render.options import RenderOptions
 from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.taxonomy import IGNORE, SKY, taxonomy
 from weather_aug.transforms.albumentations import RandomWeather, default_camera
@@ -123,6 +124,23 @@ def test_a_pipeline_survives_its_dictionary(sample: Sample) -> None:
     assert transform.max_particles == 900
     expected, actual = original(**sample), again(**sample)
     assert all((expected[name] == actual[name]).all() for name in ("image", "mask"))
+
+
+def test_effects_are_left_out_by_name(sample: Sample) -> None:
+    rain = WeatherPolicy({"rain": 1}, severity=(1.0, 1.0), falling=1.0)
+    whole = pipeline(rain)(**sample)["image"]
+    options = RenderOptions(max_particles=900, without=("relight", "sky", "film", "mirror"))
+    less = pipeline(rain, options=options)
+    assert (less(**sample)["image"] != whole).any()
+    assert (pipeline(rain, options=RenderOptions())(**sample)["image"] == whole).all()
+    again = A.from_dict(json.loads(json.dumps(A.to_dict(less))))
+    less.set_random_seed(3)
+    again.set_random_seed(3)
+    assert (less(**sample)["image"] == again(**sample)["image"]).all()
+    few = RandomWeather(options=options, max_particles=7)
+    assert few.max_particles == few.options["max_particles"] == 7
+    assert few.options["without"] == ["relight", "sky", "film", "mirror"]
+    assert RandomWeather(options=options).max_particles == 900
 
 
 def test_a_replay_gives_the_same_picture(sample: Sample) -> None:
@@ -341,6 +359,9 @@ def test_without_albumentations_the_error_names_the_extra() -> None:
         ({"speed_m_per_s": (9.0, 3.0)}, "speed_m_per_s"),
         ({"camera_height_m": 0.0}, "camera_height_m"),
         ({"max_particles": -1}, "max_particles"),
+        ({"options": "fast"}, "options must be RenderOptions"),
+        ({"options": {"speed": 3}}, "no field speed"),
+        ({"options": {"without": ["rainbow"]}}, "rainbow"),
     ],
     ids=str,
 )

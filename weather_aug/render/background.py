@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,8 +18,6 @@ from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
 
 Float32 = NDArray[np.float32]
-
-SHRUNK_WIDTH_PX = 256
 
 
 def background_of(
@@ -47,8 +44,7 @@ def looked_at(frame: Frame, ambience: Ambience) -> Layers:
 def shrunk(frame: Frame, layers: Layers) -> tuple[Frame, Layers]:
     """The frame at most 256 pixels wide, and its layers: what glass and lens see of the whole."""
     height, width = frame.image.shape[:2]
-    small_width = min(SHRUNK_WIDTH_PX, width)
-    small_height = max(1, round(height * small_width / width))
+    small_height, small_width = layers.thumbnail.shape[:2]
     rows = (np.arange(small_height) * 2 + 1) * height // (2 * small_height)
     columns = (np.arange(small_width) * 2 + 1) * width // (2 * small_width)
     places = rows[:, None], columns[None, :]
@@ -56,11 +52,13 @@ def shrunk(frame: Frame, layers: Layers) -> tuple[Frame, Layers]:
     small = replace(
         frame,
         camera=frame.camera.resized(small_width, small_height),
-        image=cv2.resize(frame.image, (small_width, small_height), interpolation=cv2.INTER_AREA),
+        image=layers.thumbnail,
         label=None if frame.label is None else np.ascontiguousarray(frame.label[places]),
         depth_m=np.ascontiguousarray(frame.depth_m[places]),
         normals_world=None,
     )
     classes = np.ascontiguousarray(layers.classes[places])
+    # Kernels are compiled for layers that nobody can write.
+    classes.flags.writeable = False
     step = layers.step * small_width / width
     return small, replace(layers, step=step, classes=classes)

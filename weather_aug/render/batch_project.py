@@ -20,6 +20,7 @@ from weather_aug.render.project import (
     DEFOCUS_VARIANCE,
     FAINTEST,
     FOCUS_M,
+    HIDING_ALPHA,
     LARGE_SHARE,
     LONG_SWEEP_PX,
     MOST_OPAQUE,
@@ -131,7 +132,8 @@ def project(
     half = torch.sqrt(reach2.clamp(min=0.0)[:, None] * torch.stack([a, c], dim=1))
     seen = (reach2 > 0.0) & _touches(u, v, half, camera)
     through = torch.exp(-air.optical_depth(z, tx, ty))[i, None]
-    area_px2 = torch.pi * reach2 * torch.sqrt(det) * parts
+    hiding2 = 2.0 * torch.log(peak / HIDING_ALPHA)
+    hidden_px2 = torch.pi * hiding2 * torch.sqrt(det) * parts
     splats = Splats(
         u=u.float(),
         v=v.float(),
@@ -141,7 +143,7 @@ def project(
         peak=peak.float(),
         z_m=z[i].float(),
         light=(airlight.double() + through * (colour - airlight).double()).float(),
-        large=area_px2 > LARGE_SHARE * camera.width * camera.height,
+        large=hidden_px2 > LARGE_SHARE * camera.width * camera.height,
     )
     return splats.take(seen)
 

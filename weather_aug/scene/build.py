@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug import _files, _lock
-from weather_aug.clip.types import Clip, Frame
+from weather_aug.clip.types import Clip, Frame, FrameKey
 from weather_aug.edit.ambience import ambience_of
 from weather_aug.errors import (
     ArgumentError,
@@ -24,16 +24,32 @@ from weather_aug.errors import (
     printable,
 )
 from weather_aug.scene import store
+from weather_aug.scene.journal import Round, digest_record, make_all
+from weather_aug.scene.layers import PARTS as LAYER_PARTS
+from weather_aug.scene.layers import encode_layers, layers_seen
 from weather_aug.scene.policy import TYPES
+from weather_aug.scene.records import (
+    FRAMES,
+    SHELTER,
+    check_name,
+    parse_frame,
+    part_of,
+    part_path,
+    streets,
+)
 from weather_aug.scene.shelter import View, shelter_of
 
 EDITORS = ("physical",)
-JOURNAL = "journal.jsonl"
+JOURNAL, LAYERS_JOURNAL = "journal.jsonl", "layers.jsonl"
 UNFINISHED_SUFFIX = ".building"
 LOCK_SUFFIX = ".building.lock"
 REPLACED_SUFFIX = ".replaced"
 
 Float64 = NDArray[np.float64]
+Entries = list[dict[str, Any]]
+"""What the manifest says of frames, as JSON values."""
+Files = dict[str, Any]
+"""Sizes and digests by relative path."""
 
 
 def build(
@@ -47,17 +63,20 @@ def build(
 ) -> None:
     """Write the scene of `clip` to the folder `out`, which appears only when it is complete.
 
-    Work in progress stands in `out` + ".building" with a journal of finished frames; the same call
-    again continues it, after making the first finished frame once more to see that the clip is
-    still the same. Bad input removes it: there is nothing to continue. A scene that is replaced
-    stands in `out` + ".replaced" until the new one is in its place.
+    There are two rounds over the frames: the first stores them; the second, when the way driven is
+    known, what the editor sees in each. Work in progress stands in `out` + ".building" with a
+    journal of each round; the same call again continues it, after making the first finished frame
+    once more to see that the clip is still the same. Bad input removes it: there is nothing to
+    continue. A scene that is replaced stands in `out` + ".replaced" until the new one is in its
+    place.
 
     Args:
         clip: The drive; every frame needs depth.
         out: Folder to make, and its parents.
         editor: How backgrounds get their weather; "physical" does it while rendering.
-        weathers: Types the scene is meant for.
-        progress: Show a bar.
+        weathers: Types the scene is meant for: a note in the manifest for readers. The physical
+            editor prepares for none, since it edits while rendering; every scene renders them all.
+        progress: Show a bar for each round.
         overwrite: Replace `out` if it is a scene already.
 
     Raises:
@@ -91,10 +110,12 @@ def _content(
     axes_world = street_axes(entries, clip.up_world)
     shelter = None
     airlight = None
-    if getattr(clip, "is_drive", True):
+    is_drive = bool(getattr(clip, "is_drive", True))
+    if is_drive:
         airlight = np.median([entry["light"]["airlight"] for entry in entries], axis=0).tolist()
         shelter, file = _write_shelter(work, entries, axes_world)
         files |= file
+    entries, looks = _write_layers(work, entries, axes_world, is_drive, progress)
     return {
         "name": clip.name,
         "editor": editor,
@@ -103,32 +124,28 @@ def _content(
         "airlight": airlight,
         "shelter": shelter,
         "frames": entries,
-        "files": files,
+        "files": files | looks,
     }
 
 
 def _write_shelter(
-    work: Path, entries: Sequence[dict[str, Any]], axes_world: Float64
-) -> tuple[dict[str, Any] | None, dict[str, Any]]:
+    work: Path, entries: Entries, axes_world: Float64
+) -> tuple[dict[str, Any] | None, Files]:
     """Map the covers that the finished frames show; the manifest's entry, and the file's digest.
 
     From the stored frames, so that a build that is continued makes the same map.
     """
     # A build that was cut short after the map may have shown covers that are gone now.
     with _files.reported(work):
-        (work / store.SHELTER).unlink(missing_ok=True)
-    records = [store.parse_frame(entry) for entry in entries]
+        (work / SHELTER).unlink(missing_ok=True)
+    records = [parse_frame(entry) for entry in entries]
     views = (View(record.camera, *store.read_surfaces(work, record)) for record in records)
     shelter = shelter_of(views, axes_world)
     if shelter is None:
         return None, {}
     record, data = store.encode_shelter(shelter)
-    _files.write_whole(work / store.SHELTER, data)
-    return record, {store.SHELTER: _digest(data)}
-
-
-def _digest(data: bytes) -> dict[str, Any]:
-    return {"size": len(data), "sha256": _files.sha256_of(data)}
+    _files.write_whole(work / SHELTER, data)
+    return record, {SHELTER: digest_record(data)}
 
 
 def street_axes(entries: Sequence[dict[str, Any]], up_world: Float64) -> Float64:
@@ -176,7 +193,7 @@ def _located(out: Path) -> Path:
 
 
 def _is_scene(folder: Path) -> bool:
-    return (folder / store.MANIFEST).is_file() and (folder / store.FRAMES).is_dir()
+    return (folder / store.MANIFEST).is_file() and (folder / FRAMES).is_dir()
 
 
 def _check_free(out: Path, overwrite: bool) -> None:
@@ -214,7 +231,8 @@ def _publish(work: Path, out: Path) -> None:
     """Put finished work in its place; whenever this is cut short, one whole scene is left."""
     replaced = _beside(out, REPLACED_SUFFIX)
     with _files.reported(out):
-        (work / JOURNAL).unlink(missing_ok=True)
+        for journal in (JOURNAL, LAYERS_JOURNAL):
+            (work / journal).unlink(missing_ok=True)
         try:
             if out.exists():
                 out.rename(replaced)
@@ -260,7 +278,7 @@ def _remove_scene(folder: Path) -> None:
 
 def _check_clip(clip: Clip) -> None:
     keys = clip.keys
-    name = store.check_name("clip name", clip.name)
+    name = check_name("clip name", clip.name)
     if not keys:
         raise ClipError(f"clip {name} has no frames; there is nothing to build")
     if len(keys) > store.MAX_FRAMES:
@@ -271,31 +289,29 @@ def _check_clip(clip: Clip) -> None:
     if len(set(keys)) < len(keys):
         raise ClipError(f"clip {name} has a frame twice; its keys must differ")
     for camera in dict.fromkeys(key.camera for key in keys):
-        store.check_name("camera name", camera)
+        check_name("camera name", camera)
     length = float(np.linalg.norm(np.asarray(clip.up_world, np.float64)))
     if not abs(length - 1) < 1e-3:
         raise ClipError(f"clip {name}: up_world must be a unit vector, its length is {length:g}")
 
 
-def _write_frames(
-    clip: Clip, work: Path, progress: bool
-) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def _write_frames(clip: Clip, work: Path, progress: bool) -> tuple[Entries, Files]:
     """Write all frames; entries for the manifest in the clip's order, and each file's digest."""
-    from tqdm.auto import tqdm
 
-    done = _finished(clip, work)
+    def made(key: FrameKey) -> tuple[dict[str, Any], dict[str, bytes]]:
+        return _stored(clip.frame(key), clip.up_world)
+
+    head = {
+        "version": store.VERSION,
+        "name": clip.name,
+        "keys": _digest_of([str(key) for key in clip.keys]),
+        "up_world": np.asarray(clip.up_world).tolist(),
+    }
+    task = Round("build", JOURNAL, head, clip.keys, made, _emptied)
+    done = make_all(task, work, progress)
     start_s = None
-    with _files.reported(work), (work / JOURNAL).open("a", encoding="utf-8") as journal:
-        for key in tqdm(clip.keys, desc="build", unit="frame", disable=not progress):
-            if str(key) not in done:
-                record, parts = _stored(clip.frame(key), clip.up_world)
-                for relative, data in parts.items():
-                    _files.write_whole(work / relative, data)
-                done[str(key)] = record
-                journal.write(json.dumps({"key": str(key), **record}) + "\n")
-                journal.flush()
-    entries: list[dict[str, Any]] = []
-    files: dict[str, Any] = {}
+    entries: Entries = []
+    files: Files = {}
     for key in clip.keys:
         entry = done[str(key)]["entry"]
         # Times of day lose the precision that motion needs; a clip starts at 0.
@@ -306,7 +322,7 @@ def _write_frames(
 
 
 def _stored(frame: Frame, up_world: Float64) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """What is written for a frame: its record in the journal, and bytes by relative path."""
+    """The manifest's entry for a frame, and bytes by relative path."""
     if frame.depth_m is None:
         raise ClipError(
             f"frame {frame.key} has no depth and no label to take a geometric prior from; give the "
@@ -314,63 +330,52 @@ def _stored(frame: Frame, up_world: Float64) -> tuple[dict[str, Any], dict[str, 
         )
     axes = np.zeros((3, 3))
     axes[2] = up_world
-    ambience = ambience_of(frame, axes)
-    parts = {
-        store.part_path(frame.key, part): data for part, data in store.encode_frame(frame).items()
-    }
-    entry = store.frame_record(frame, ambience)
-    files = {relative: _digest(data) for relative, data in parts.items()}
-    return {"entry": entry, "files": files}, parts
+    parts = store.encode_frame(frame)
+    entry = store.frame_record(frame, ambience_of(frame, axes))
+    return entry, {part_path(frame.key, part): data for part, data in parts.items()}
 
 
-def _finished(clip: Clip, work: Path) -> dict[str, dict[str, Any]]:
-    """Frames by key that interrupted work on this clip has finished; else an empty work folder."""
-    head = {
-        "version": store.VERSION,
-        "name": clip.name,
-        "keys": _files.sha256_of(json.dumps([str(key) for key in clip.keys]).encode()),
-        "up_world": np.asarray(clip.up_world).tolist(),
-    }
-    done = _read_journal(work, head)
-    # The head cannot tell another size or source of depth; a frame made again can.
-    first = next((key for key in clip.keys if str(key) in done), None)
-    if first is not None:
-        record, _ = _stored(clip.frame(first), clip.up_world)
-        done = done if json.dumps(record) == json.dumps(done[str(first)]) else {}
-    with _files.reported(work):
-        if not done and work.exists():
-            shutil.rmtree(work)
-        (work / store.FRAMES).mkdir(parents=True, exist_ok=True)
-    lines = [head, *({"key": key, **record} for key, record in done.items())]
-    _files.write_whole(work / JOURNAL, "".join(json.dumps(x) + "\n" for x in lines).encode())
-    return done
+def _emptied(work: Path) -> None:
+    if work.exists():
+        shutil.rmtree(work)
+    (work / FRAMES).mkdir(parents=True)
 
 
-def _read_journal(work: Path, head: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Records of an interrupted job of this head, by key, whose files are whole."""
-    path = work / JOURNAL
-    if not path.is_file():
-        return {}
-    records = _readable_prefix(path.read_text(encoding="utf-8", errors="replace").splitlines())
-    if not records or records[0] != head:
-        return {}
-    return {
-        record["key"]: {"entry": record["entry"], "files": record["files"]}
-        for record in records[1:]
-        if all(_is_whole(work / path, file) for path, file in record["files"].items())
-    }
+def _write_layers(
+    work: Path, entries: Entries, axes_world: Float64, is_drive: bool, progress: bool
+) -> tuple[Entries, Files]:
+    """Write what the editor knows of each finished frame; the entries with it, and the digests.
+
+    From the stored frames, so that it is what rendering them would find out.
+    """
+    records = [parse_frame(entry) for entry in entries]
+    street_by_camera = streets(records, axes_world, is_drive=is_drive)
+    by_key = {record.key: record for record in records}
+
+    def made(key: FrameKey) -> tuple[dict[str, Any], dict[str, bytes]]:
+        frame = store.read_frame(work, by_key[key])
+        entry, parts = encode_layers(frame, layers_seen(frame, street_by_camera[key.camera]))
+        return entry, {part_path(key, part): data for part, data in parts.items()}
+
+    head = {"layers": _digest_of([is_drive, axes_world.tolist(), entries])}
+    keys = tuple(by_key)
+    done = make_all(Round("layers", LAYERS_JOURNAL, head, keys, made, _bare), work, progress)
+    with_layers: Entries = []
+    files: Files = {}
+    for key, entry in zip(keys, entries, strict=True):
+        record = done[str(key)]
+        paths = {part_of(relative): relative for relative in record["files"]}
+        with_layers.append(entry | {"layers": record["entry"], "files": entry["files"] | paths})
+        files |= record["files"]
+    return with_layers, files
 
 
-def _is_whole(path: Path, file: dict[str, Any]) -> bool:
-    return path.is_file() and _files.sha256_of_file(path) == file["sha256"]
+def _bare(work: Path) -> None:
+    """Remove layers that belong to other frames or to another way of looking at them."""
+    for part in LAYER_PARTS:
+        for path in (work / FRAMES).glob(f"*.{part}.npy*"):
+            path.unlink()
 
 
-def _readable_prefix(lines: list[str]) -> list[dict[str, Any]]:
-    """The journal's lines before the one that a crash cut."""
-    records = []
-    for line in lines:
-        try:
-            records.append(json.loads(line))
-        except ValueError:
-            break
-    return records
+def _digest_of(value: Any) -> str:
+    return _files.sha256_of(json.dumps(value).encode())

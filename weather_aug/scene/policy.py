@@ -15,7 +15,23 @@ from weather_aug.severity import parse_severity
 from weather_aug.weather import Weather
 
 TYPES = ("clear", "rain", "snow", "fog")
-_FIELDS = ("types", "severity", "falling")
+COMMONEST_SEVERITY = 0.5
+"""Moderate: what falls and lies in most pictures of bad weather."""
+VARIED = {
+    "wetness": (0.6, 1.4, 1.0),
+    "puddles": (0.0, 4.0, 1.0),
+    "snow_cover": (0.5, 1.5, 1.0),
+    "road_snow_cover": (0.0, 2.5, 1.0),
+    "snow_depth_m": (0.4, 2.0, 2.0),
+    "overcast": (0.7, 1.3, 1.0),
+    "lamps": (0.2, 1.6, 1.0),
+    "lens_drops": (0.0, 3.0, 500.0),
+    "wipers": (0.2, 1.8, 1.0),
+}
+"""What differs between days of equal severity: least and greatest factor of the severity's value,
+and what the product is cut at. Streets drain and are swept, it has rained for minutes or for hours,
+drivers and windscreens differ. New names go to the end, so that draws of the others stay."""
+_FIELDS = ("types", "severity", "falling", "variation")
 
 
 @dataclass(frozen=True)
@@ -36,21 +52,28 @@ class WeatherPolicy:
 
     Convention:
         A draw is a pure function of (seed, epoch, item): no worker, order or earlier draw changes
-        it. Types are weighted; a name with "+" (such as "rain+fog") is both at once. Severity is
-        uniform in its range; the wind blows from any side with equal chance. Of the draws of rain
-        and snow a share `falling` falls; the others show only what it leaves behind (for now the
-        overcast sky: wet ground and snow cover are not drawn yet).
+        it. Types are weighted; a name with "+" (such as "rain+fog") is both at once. Of the default
+        a quarter stays clear, because a network that sees weather on every sample forgets clear
+        days. Severity has a triangular density over its range with its peak at moderate (0.5), or
+        at the end of the range that is nearest to it. The wind blows from any side with equal
+        chance. Of the draws of rain and snow a share `falling` falls; the others show what it
+        leaves behind: wet or white ground under clouds, clear air and clean glass. What differs
+        from day to day at equal severity (`VARIED`: how wet, puddled or white the road is, lamps,
+        drops on the glass, ...) is multiplied by factors that are uniform in their ranges and do
+        not know of each other.
 
     Raises:
         ArgumentError: If a type is unknown, a weight negative, or a range outside [0, 1].
     """
 
     types: Mapping[str, float] = field(
-        default_factory=lambda: {"clear": 1.0, "rain": 2.0, "snow": 2.0, "fog": 1.0}
+        default_factory=lambda: {"clear": 1.0, "rain": 1.0, "snow": 1.0, "fog": 1.0}
     )
     """Weight of each type; they need not sum to 1."""
     severity: tuple[float, float] = (0.1, 1.0)
     falling: float = 0.8
+    variation: float = 1.0
+    """How much of the factors' ranges is used: 0 gives each severity's own values, 1 all of it."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.types, Mapping) or not self.types:
@@ -73,6 +96,7 @@ class WeatherPolicy:
         if low > high:
             raise ArgumentError(f"severity must be a range (low, high), got {self.severity}")
         object.__setattr__(self, "falling", finite("falling", self.falling, 0, 1))
+        object.__setattr__(self, "variation", finite("variation", self.variation, 0, 1))
         object.__setattr__(self, "types", types)
         object.__setattr__(self, "severity", (low, high))
 
@@ -81,16 +105,27 @@ class WeatherPolicy:
         key = key_of("weather-draw", seed, epoch, item)
         which, how, falls, direction, particles = uniforms(key, 5)
         kind = self._kind(which)
-        severity = self.severity[0] + (self.severity[1] - self.severity[0]) * float(how)
+        severity = _triangular(float(how), *self.severity)
         falling = float(falls) < self.falling
         parts = [weather_of(part, severity, falling=falling) for part in kind.split("+")]
-        weather = reduce(Weather.mix, parts)
+        weather = self._varied(reduce(Weather.mix, parts), key_of("weather-day", seed, epoch, item))
         speed = math.hypot(*weather.wind_m_per_s)
         angle = 2 * math.pi * float(direction)
         wind = (speed * math.cos(angle), speed * math.sin(angle), 0.0)
         return WeatherDraw(
             replace(weather, wind_m_per_s=wind), int(particles * 2**53), kind, severity
         )
+
+    def _varied(self, weather: Weather, key: int) -> Weather:
+        """The weather on one of the days of its severity."""
+        changes = {}
+        for uniform, (name, (least, greatest, most)) in zip(
+            uniforms(key, len(VARIED)), VARIED.items(), strict=True
+        ):
+            factor = least + (greatest - least) * float(uniform)
+            value = getattr(weather, name) * (1 + self.variation * (factor - 1))
+            changes[name] = min(value, most)
+        return replace(weather, **changes)
 
     def _kind(self, uniform: float) -> str:
         left = uniform * sum(self.types.values())
@@ -102,7 +137,12 @@ class WeatherPolicy:
 
     def to_dict(self) -> dict[str, Any]:
         """Fields as JSON values."""
-        return {"types": dict(self.types), "severity": list(self.severity), "falling": self.falling}
+        return {
+            "types": dict(self.types),
+            "severity": list(self.severity),
+            "falling": self.falling,
+            "variation": self.variation,
+        }
 
     @classmethod
     def from_dict(cls, state: dict[str, Any]) -> WeatherPolicy:
@@ -117,6 +157,19 @@ class WeatherPolicy:
                 f"WeatherPolicy has no field {printable(unknown[0])}; it has {', '.join(_FIELDS)}"
             )
         return cls(**state)
+
+
+def _triangular(uniform: float, low: float, high: float) -> float:
+    """The number below which a share `uniform` of the triangular law with its peak at moderate is.
+
+    The inverse of the law's distribution on [low, high].
+    """
+    if low == high:
+        return low
+    width, peak = high - low, min(max(COMMONEST_SEVERITY, low), high)
+    if uniform * width < peak - low:
+        return low + math.sqrt(uniform * width * (peak - low))
+    return high - math.sqrt((1 - uniform) * width * (high - peak))
 
 
 def weather_of(kind: str, severity: float | str, *, falling: bool = True) -> Weather:

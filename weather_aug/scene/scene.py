@@ -10,17 +10,20 @@ from typing import TYPE_CHECKING, Any
 
 from weather_aug.clip.types import Clip, Frame, FrameKey, Window
 from weather_aug.edit.ambience import Ambience
+from weather_aug.edit.physical.layers import Layers
 from weather_aug.errors import ArgumentError, IntegrityError, printable
 from weather_aug.particles.shelter import Shelter
 from weather_aug.render.compose import RenderedFrame, render
 from weather_aug.render.fields import RigMotion
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene import store
+from weather_aug.scene.layers import Street, layers_seen
+from weather_aug.scene.records import FrameRecord, Manifest, streets
 from weather_aug.timeline import WeatherTimeline
+from weather_aug.weather import Weather
 
 if TYPE_CHECKING:
     from weather_aug.air import Air
-    from weather_aug.weather import Weather
 
 
 class WeatherScene:
@@ -28,9 +31,11 @@ class WeatherScene:
 
     Convention:
         A scene is immutable and holds only its folder's path: it opens lazily, and pickles to a
-        worker as the path. Pictures are decoded per call; depth and labels are memory-mapped, which
-        trusts the storage not to shrink a file while it is open. Rendering is a pure function of
-        (scene, key, weather, seed, window, options).
+        worker as the path. Pictures are decoded per call; depth, labels and layers are
+        memory-mapped, which trusts the storage not to shrink a file while it is open. Rendering is
+        a pure function of (scene, key, weather, seed, window, options). A scene that was built
+        before layers were stored finds them out at each render, to the same picture; building it
+        again makes that time free.
     """
 
     def __init__(self, path: Path) -> None:
@@ -74,7 +79,7 @@ class WeatherScene:
         return cls.load(out)
 
     @cached_property
-    def manifest(self) -> store.Manifest:
+    def manifest(self) -> Manifest:
         """The table of contents, read on first use."""
         return store.read_manifest(self.path)
 
@@ -129,6 +134,31 @@ class WeatherScene:
         """
         return store.read_shelter(self.path, self.manifest)
 
+    def layers(self, key: FrameKey) -> Layers:
+        """What the editor knows of a frame: read from the scene, or found out if it is of before.
+
+        Raises:
+            ArgumentError: If the scene has no such frame.
+            SceneError: If a file of it cannot be read any more.
+        """
+        record = self._record(key)
+        if record.layers is None:
+            return self._layers_of(self.frame(key))
+        _, label = store.read_surfaces(self.path, record)
+        layers = store.read_layers(self.path, record, label)
+        assert layers is not None
+        return layers
+
+    def _layers_of(self, frame: Frame) -> Layers:
+        stored = store.read_layers(self.path, self._record(frame.key), frame.label)
+        return stored or layers_seen(frame, self._streets[frame.key.camera])
+
+    @cached_property
+    def _streets(self) -> dict[str, Street]:
+        manifest = self.manifest
+        is_drive = manifest.airlight is not None
+        return streets(manifest.frames, manifest.axes_world, is_drive=is_drive)
+
     def render(
         self,
         key: FrameKey,
@@ -157,6 +187,8 @@ class WeatherScene:
         if isinstance(weather, WeatherTimeline):
             air = air or weather.air(frame.time_s, seed)
             weather = weather.at(frame.time_s)
+        # A clear picture is returned as it is, and what is no weather is refused.
+        is_seen = isinstance(weather, Weather) and not weather.is_clear
         return render(
             frame,
             weather,
@@ -166,6 +198,7 @@ class WeatherScene:
             air=air,
             shelter=self.shelter,
             rig=self._rig_motion(frame.key) if options.needs_rig else None,
+            layers=self._layers_of(frame) if is_seen else None,
             options=options,
         )
 
@@ -186,7 +219,7 @@ class WeatherScene:
         camera = self._record(key).camera
         return camera.height, camera.width
 
-    def _record(self, key: FrameKey) -> store.FrameRecord:
+    def _record(self, key: FrameKey) -> FrameRecord:
         try:
             record = self.manifest.by_key.get(FrameKey(*key))
         except TypeError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import asdict, fields, replace
 from typing import Any
 
 import numpy as np
@@ -61,7 +62,9 @@ class RandomWeather(A.DualTransform):
         policy: Which weather how often, or its `to_dict` form.
         speed_m_per_s: Range of the car's speed, which leans and lengthens the streaks.
         camera_height_m: Of the geometric prior.
-        max_particles: Budget of the renderer.
+        max_particles: Budget of the renderer, instead of the one in `options`.
+        options: Choices besides the weather, or their fields as a dict; effects are left out by
+            name, as in `RenderOptions(without=("drops", "noise"))`.
         p: Probability of any weather.
 
     Raises:
@@ -77,15 +80,17 @@ class RandomWeather(A.DualTransform):
         policy: Any
         speed_m_per_s: tuple[float, float]
         camera_height_m: float
-        max_particles: int
+        max_particles: int | None
+        options: Any
 
     def __init__(
         self,
         policy: WeatherPolicy | dict[str, Any] | None = None,
         speed_m_per_s: tuple[float, float] = (0.0, 15.0),
         camera_height_m: float = 1.5,
-        max_particles: int = DEFAULT_OPTIONS.max_particles,
+        max_particles: int | None = None,
         p: float = 0.5,
+        options: RenderOptions | dict[str, Any] | None = None,
     ) -> None:
         super().__init__(p=p)
         if isinstance(policy, WeatherPolicy):
@@ -96,7 +101,12 @@ class RandomWeather(A.DualTransform):
             raise ArgumentError(f"speed_m_per_s must be a range (low, high), got {speed_m_per_s}")
         self.speed_m_per_s = (low, high)
         self.camera_height_m = finite("camera_height_m", camera_height_m, 0.1, 100)
-        self.max_particles = RenderOptions(max_particles).max_particles
+        chosen = _options(options)
+        if max_particles is not None:
+            chosen = replace(chosen, max_particles=max_particles)
+        # As JSON values, so that a pipeline can be written down.
+        self.options = asdict(chosen) | {"without": list(chosen.without)}
+        self.max_particles = chosen.max_particles
 
     def get_params(self) -> dict[str, Any]:
         """Draw weather, seed and speed: JSON values only, so that a replay can store them."""
@@ -145,7 +155,7 @@ class RandomWeather(A.DualTransform):
             Weather.from_dict(params["weather"]),
             seed=params["seed"],
             ambience=ambience_of(frame, STREET_AXES @ camera.world_from_camera[:3, :3].T),
-            options=RenderOptions(self.max_particles),
+            options=_options(self.options),
         )
 
     def _depth(self, depth: Any, label: UInt8 | None, camera: Camera) -> NDArray[Any]:
@@ -182,6 +192,24 @@ def default_camera(shape: tuple[int, int], speed_m_per_s: float) -> Camera:
         exposure_s=EXPOSURE_S,
         velocity_m_per_s=np.array([0.0, 0.0, speed_m_per_s]),
     )
+
+
+def _options(options: Any) -> RenderOptions:
+    if options is None:
+        return DEFAULT_OPTIONS
+    if isinstance(options, RenderOptions):
+        return options
+    if not isinstance(options, dict):
+        raise ArgumentError(
+            f"options must be RenderOptions, or a dict of its fields, got {type(options).__name__}"
+        )
+    known = [field.name for field in fields(RenderOptions)]
+    unknown = sorted(set(options) - set(known), key=str)
+    if unknown:
+        raise ArgumentError(
+            f"RenderOptions has no field {printable(unknown[0])}; it has {', '.join(known)}"
+        )
+    return RenderOptions(**options)
 
 
 def _worker_seed() -> int:

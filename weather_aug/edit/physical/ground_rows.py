@@ -29,11 +29,17 @@ from weather_aug.edit.physical.spread import spread_run
 LANE_M, WHEEL_M, TRACK_M = 3.5, 0.75, 0.28
 """Width of a lane, wheels from its middle, half the width of a track."""
 SNOW_ALBEDO, ASPHALT_ALBEDO = 0.85, 0.12
+WANDER_M = 0.16
+"""How far tracks wander within the width of a lane."""
+TRACK_COVER, TRACK_SOFTNESS = 0.15, 0.16
+"""Share of the road's snow that stays in a track, and how much softer snow ends on a road."""
 FLATTEST_SINE = 0.02
 RUT_WATER = 1.5
 """How much more water stands in wheel tracks, as a share."""
 POOL_DARKENING = 0.2
 """Of what lies under standing water, besides the film's."""
+SHOWING_THROUGH = 0.1
+"""Share of the contrast below the snow that is left."""
 CLEAN, SLUSH = 0.90, 0.76
 """Brightness of the darkest snow over the lightest, beside the road and on it."""
 GUESSED_HEIGHTS = (0.05, 0.20)
@@ -96,7 +102,7 @@ def ground_run(run, depth, geometry, look, material, small, cell, share, b):
             ripple(run, depth, geometry, look, b)
         _mirror(x0, x1, look.flooded, b)
     if amount > zero:
-        _cover(x0, x1, amount, b)
+        _cover(x0, x1, amount, np.float32(TRACK_SOFTNESS) if road else zero, b)
         _lay(x0, x1, look, np.float32(SLUSH) if road else np.float32(CLEAN), b)
 
 
@@ -131,10 +137,10 @@ def _tracks(x0, x1, strength, b):
     """From how far left of the way to how far in a wheel's track; other lanes are driven less."""
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
     for x in range(x0, x1):
-        side = b[SIDE, x] + half * (b[NOISE, x] - half)
+        side = b[SIDE, x] + np.float32(WANDER_M) * (b[NOISE, x] - half)
         lane = np.floor(side * np.float32(1.0 / LANE_M) + half)
         off = abs(abs(side - np.float32(LANE_M) * lane) - np.float32(WHEEL_M))
-        track = one - ramp(np.float32(0.5 * TRACK_M), np.float32(1.5 * TRACK_M), off)
+        track = one - ramp(np.float32(0.3 * TRACK_M), np.float32(1.7 * TRACK_M), off)
         driven = one - np.float32(0.45) * abs(lane)
         b[SIDE, x] = strength * track * (driven if driven > zero else zero)
 
@@ -191,11 +197,11 @@ def _mirror(x0, x1, flooded_share, b):
 
 
 @compiled
-def _cover(x0, x1, amount, b):
+def _cover(x0, x1, amount, softness, b):
     one = np.float32(1.0)
     for x in range(x0, x1):
-        spared = amount * (one - np.float32(0.85) * b[SIDE, x])
-        b[COVERED, x] = covered(spared, _fuzz(b[SIZE, x]), b[NOISE, x])
+        left = amount * (one - np.float32(1.0 - TRACK_COVER) * b[SIDE, x])
+        b[COVERED, x] = covered(left, _fuzz(b[SIZE, x]) + softness, b[NOISE, x])
 
 
 @compiled
@@ -209,7 +215,7 @@ def _lay(x0, x1, look, least, b):
         under = luminance(b[R, x], b[G, x], b[B, x]) / (asphalt * light)
         under = under if under < np.float32(2.0) else np.float32(2.0)
         shade = least + (np.float32(1.02) - least) * b[NOISE, x]
-        shade *= np.float32(0.95) + np.float32(0.05) * under
+        shade *= np.float32(1.0 - SHOWING_THROUGH) + np.float32(SHOWING_THROUGH) * under
         lay_snow(x, b[COVERED, x], bright * shade / grey, look, b)
 
 

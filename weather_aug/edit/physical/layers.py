@@ -7,13 +7,14 @@ every weather of it is a function of them, pixel by pixel.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from weather_aug.colour import LUMINANCE, srgb_from_linear
+from weather_aug._rows import halves
+from weather_aug.colour import LUMINANCE
 from weather_aug.edit.physical import relight, settling
 from weather_aug.edit.physical.mirror import mirror_map, mirrored
 from weather_aug.edit.physical.overcast import ZENITH_GAIN
@@ -38,6 +39,7 @@ GROUND_GAIN, OBJECT_GAIN, MATTE = 0, 4, 6
 ILLUMINATION, LUMINANCE_MEAN, FACING_UP, LATERAL_M = range(8, 12)
 SHARP, ROUGH = 12, 16
 MEAN_CELLS = 9
+THUMBNAIL_WIDTH_PX = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +55,10 @@ class Layers:
     """(3,) of the road: up = plane[0] + plane[1] along + plane[2] left, street axes."""
     classes: UInt8
     """(H, W) train ids, guessed where nobody labelled."""
-
-    @cached_property
-    def illumination(self) -> float:
-        """Luminance of a white surface in the recorded street, linear light."""
-        return float(np.median(self.maps[ILLUMINATION]))
+    illumination: float
+    """Luminance of a white surface in the recorded street, linear light."""
+    thumbnail: UInt8
+    """(h', w', 3) sRGB, the picture at most 256 pixels wide: what glass and glare see of it."""
 
 
 def layers_of(site: Site, path: Float64 | None = None) -> Layers:
@@ -75,7 +76,7 @@ def layers_of(site: Site, path: Float64 | None = None) -> Layers:
     shown = mirrored(mirror, surfaces.astype(np.float32), np.zeros((2, 3)))
     sky_gain = np.array([[1.0] * 3, [1.0 + ZENITH_GAIN] * 3])
     free = mirrored(mirror, np.zeros_like(site.light), sky_gain)
-    luminance = (site.light @ LUMINANCE).astype(np.float32)
+    luminance = site.light @ LUMINANCE.astype(np.float32)
     planes = (
         *np.moveaxis(flat.ground, -1, 0),
         *np.moveaxis(flat.objects, -1, 0),
@@ -89,14 +90,40 @@ def layers_of(site: Site, path: Float64 | None = None) -> Layers:
         *np.moveaxis(shown.rough, -1, 0),
         free.rough[..., 0],
     )
-    stack = np.stack(planes).astype(np.float16)
-    stack.flags.writeable = False
-    return Layers(float(site.step), stack, flat.tint, site.plane, site.classes)
+    stack = halves(np.stack(planes))
+    return Layers(
+        float(site.step),
+        _shared(stack),
+        _shared(flat.tint),
+        _shared(site.plane),
+        _shared(site.classes),
+        float(np.median(stack[ILLUMINATION])),
+        _shared(thumbnail_of(site.frame.image)),
+    )
+
+
+def thumbnail_shape(height: int, width: int) -> tuple[int, int]:
+    """(h', w') of the thumbnail of a picture, pixels."""
+    small_width = min(THUMBNAIL_WIDTH_PX, width)
+    return max(1, round(height * small_width / width)), small_width
+
+
+def thumbnail_of(image: UInt8) -> UInt8:
+    """The picture (H, W, 3) at most 256 pixels wide, by means of its pixels."""
+    height, width = thumbnail_shape(*image.shape[:2])
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
+
+
+def _shared(array: NDArray[Any]) -> Any:
+    """A view that nobody can write: layers are shared, and kernels are compiled for such arrays."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def overcast_light(site: Site, flat: relight.Flattening) -> Float32:
     """Linear light (h, w, 3) of what stands, without the sun's."""
-    luma = srgb_from_linear(np.clip(site.light, 0, 1)) @ LUMINANCE
+    luma = site.srgb @ LUMINANCE.astype(np.float32)
     slope, offset = flat.objects[..., 0], flat.objects[..., 1]
     gain = np.clip(slope * luma + offset, relight.LEAST_GAIN, relight.MOST_GAIN)
     return (site.light * np.exp(gain)[..., None]).astype(np.float32)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from weather_aug.colour import LUMINANCE
 from weather_aug.edit.physical.guided import box_mean, box_sum, guided_coefficients
-from weather_aug.edit.physical.site import Site
+from weather_aug.edit.physical.site import Site, shrunk
 from weather_aug.taxonomy import GROUND, ROAD, SIDEWALK, SKY, TERRAIN, TRAIN_ID, VEGETATION
 
 Bool = NDArray[np.bool_]
@@ -99,10 +99,10 @@ def sky_matte(site: Site) -> tuple[Float32, Float32]:
         The compositing equation of two known colours, as in Smith and Blinn, "Blue Screen
         Matting", SIGGRAPH 1996, with one feature.
     """
-    is_sky = _area(np.where(site.classes == SKY, np.uint8(255), np.uint8(0)), site.step)
+    is_sky = _share(site)
     if is_sky.max() < 0.5:
         return np.zeros(site.shape, np.float32), np.zeros(site.shape, np.float32)
-    srgb = _srgb(site)
+    srgb = site.srgb
     feature = _mixed(srgb, SKY_FEATURE)
     # The local sky is the labelled sky without what is dark in it.
     whole = (is_sky > 0.99).astype(np.float32)
@@ -151,7 +151,7 @@ def flattening(site: Site) -> Flattening:
     nearer to the mean of their surroundings. The sky, vehicles, lamps, signs and people stay as
     they are: how dark they are says more of their paint than of the sun.
     """
-    luma = _mixed(_srgb(site), LUMINANCE)
+    luma = _mixed(site.srgb, LUMINANCE)
     level = np.log(_mixed(site.light, LUMINANCE) + np.float32(DARK))
     ground = site.is_ground & np.isfinite(site.depth_m)
     objects = _object_gain(site, luma, level)
@@ -175,7 +175,7 @@ def illumination(site: Site, flat: Flattening) -> Float32:
     Source:
         An aged asphalt's albedo of 0.12; other ground is taken for 0.18.
     """
-    luma = _mixed(_srgb(site), LUMINANCE)
+    luma = _mixed(site.srgb, LUMINANCE)
     lines = flat.ground
     gain = np.clip(lines[..., 0] * luma + lines[..., 1], lines[..., 2], lines[..., 3])
     flattened = np.log(_mixed(site.light, LUMINANCE) + np.float32(DARK)) + gain
@@ -383,18 +383,7 @@ def _mixed(colours: Float32, weights: Any) -> Float32:
     return cv2.transform(colours, np.asarray(weights, np.float32)[None])
 
 
-def _srgb(site: Site) -> Float32:
-    """(h, w, 3) means of the cells' sRGB values, in [0, 1]."""
-    return _area(site.frame.image, site.step)
-
-
-def _area(plane: NDArray[np.uint8], step: int) -> Float32:
-    """Means (h, w, ...) in [0, 1] of the cells of a plane of levels (H, W, ...)."""
-    height, width = plane.shape[:2]
-    rows, columns = -(-height // step), -(-width // step)
-    if (rows * step, columns * step) != (height, width):
-        plane = cv2.copyMakeBorder(
-            plane, 0, rows * step - height, 0, columns * step - width, cv2.BORDER_REPLICATE
-        )
-    means = cv2.resize(plane, (columns, rows), interpolation=cv2.INTER_AREA)
-    return means.astype(np.float32) * np.float32(1 / 255)
+def _share(site: Site) -> Float32:
+    """(h, w) share of the sky's label in each cell."""
+    labelled = np.where(site.classes == SKY, np.uint8(255), np.uint8(0))
+    return shrunk(labelled, site.step).astype(np.float32) * np.float32(1 / 255)

@@ -21,7 +21,7 @@ def facing_up(site: Site) -> Float32:
 
     From the places of the cell above and the cell below; across a jump of depth nothing is level.
     """
-    points = site.points.astype(np.float64)
+    points = site.offsets
     with np.errstate(invalid="ignore"):
         rise = np.zeros_like(points)
         rise[1:-1] = points[:-2] - points[2:]

@@ -77,9 +77,19 @@ class Site:
         return small
 
     @cached_property
-    def light(self) -> Float32:
-        """(h, w, 3) linear light, the means of the cells."""
+    def levels(self) -> UInt8:
+        """(h, w, 3) sRGB, the means of the cells."""
         return shrunk(self.frame.image, self.step)
+
+    @cached_property
+    def srgb(self) -> Float32:
+        """(h, w, 3) the same in [0, 1]."""
+        return self.levels.astype(np.float32) * np.float32(1 / 255)
+
+    @cached_property
+    def light(self) -> Float32:
+        """(h, w, 3) the same as linear light."""
+        return cv2.LUT(self.levels, SRGB_LEVELS_LINEAR.astype(np.float32))
 
     @cached_property
     def rays(self) -> Float32:
@@ -94,16 +104,22 @@ class Site:
     @cached_property
     def points(self) -> Float32:
         """(h, w, 3) places of the surfaces in street axes; not finite in the sky."""
+        return (self.origin + self.offsets).astype(np.float32)
+
+    @cached_property
+    def offsets(self) -> Float32:
+        """(h, w, 3) the same from the camera."""
         with np.errstate(invalid="ignore"):
-            return (self.origin + self.depth_m[..., None] * self.rays).astype(np.float32)
+            return self.depth_m[..., None] * self.rays
 
     @cached_property
     def height_m(self) -> Float32:
         """(h, w) of the surfaces over the road's plane; `inf` in the sky."""
+        above = self.origin[2] - self.plane[0] - self.plane[1:] @ self.origin[:2]
+        climb = np.array([-self.plane[1], -self.plane[2], 1.0], np.float32)
         with np.errstate(invalid="ignore"):
-            along, left, up = np.moveaxis(self.points, -1, 0)
-            height = up - (self.plane[0] + self.plane[1] * along + self.plane[2] * left)
-        return np.where(np.isfinite(self.depth_m), height, np.inf).astype(np.float32)
+            height = np.float32(above) + self.offsets @ climb
+        return np.where(np.isfinite(self.depth_m), height, np.float32(np.inf))
 
     @cached_property
     def is_ground(self) -> NDArray[np.bool_]:
@@ -127,15 +143,15 @@ def site_of(frame: Frame, axes_world: Float64, camera_height_m: float) -> Site:
     return Site(frame, axes_world, camera_height_m, step, classes, plane)
 
 
-def shrunk(image: UInt8, step: int) -> Float32:
-    """Linear light (h, w, 3) float32 of a picture (H, W, 3) sRGB: the means of its cells."""
-    height, width = image.shape[:2]
+def shrunk(plane: UInt8, step: int) -> UInt8:
+    """Means (h, w, ...) of the cells of a plane of levels (H, W, ...)."""
+    height, width = plane.shape[:2]
     rows, columns = -(-height // step), -(-width // step)
-    padded = cv2.copyMakeBorder(
-        image, 0, rows * step - height, 0, columns * step - width, cv2.BORDER_REPLICATE
-    )
-    light = cv2.LUT(padded, SRGB_LEVELS_LINEAR.astype(np.float32))
-    return cv2.resize(light, (columns, rows), interpolation=cv2.INTER_AREA)
+    if (rows * step, columns * step) != (height, width):
+        plane = cv2.copyMakeBorder(
+            plane, 0, rows * step - height, 0, columns * step - width, cv2.BORDER_REPLICATE
+        )
+    return cv2.resize(plane, (columns, rows), interpolation=cv2.INTER_AREA)
 
 
 def street_rays(camera: Camera, axes_world: Float64, shape: tuple[int, int], step: int) -> Float32:

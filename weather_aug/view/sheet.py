@@ -29,10 +29,12 @@ UInt8 = NDArray[np.uint8]
 KINDS = ("rain", "snow", "fog")
 SEVERITIES = ("light", "moderate", "heavy", "extreme")
 STATES = {
-    "wet road, no rain": Weather.rain("heavy", falling=False),
-    "fresh snow, clear air": Weather.snow("extreme", falling=False, overcast=0.8),
+    "wet road, no rain": Weather.rain("heavy", falling=False, puddles=0.45),
+    "fresh snow, clear air": Weather.snow(
+        "heavy", falling=False, road_snow_cover=0.75, snow_depth_m=0.12
+    ),
     "dense fog, lamps on": Weather.fog(visibility_m=70.0, lamps=1.0),
-    "heavy rain, wet glass": Weather.rain("heavy", lens_drops=60.0, wipers=0.0),
+    "heavy rain, wet glass": Weather.rain("heavy", lens_drops=90.0, wipers=0.0),
 }
 """What a filter over the picture cannot draw: light, ground, air, and the glass before the lens."""
 _MARGIN_PX = 4

@@ -2,7 +2,7 @@
 
 Each check is a function `check_*` that a test runs once on the package (it passes) and once on each
 planted fault (it fails; tests named `..._found_out`). The numbers are those of the
-table of promises in docs/physics.md; 14 is kept for the wet road.
+table of promises in docs/physics.md.
 
 no  what                         check (file test_sanity_..., function)       planted faults
 1   Beer and Lambert, scatter    extinction.check_beer_lambert                paper's opacities
@@ -35,6 +35,10 @@ no  what                         check (file test_sanity_..., function)       pl
 13  ... height fog               fog.check_height_fog                         even, surface, depth
 13  ... its kernel               fog.check_kernel                             depth for range
 13  ... sky                      fog.check_sky                                box of 80 m
+14  Fresnel                      surfaces.check_fresnel                       Schlick
+14  ... film                     surfaces.check_film                          fixed darkening
+14  ... diffuse                  surfaces.check_diffuse                       dry film
+14  ... mirror                   surfaces.check_mirror                        normals, even share
 15  labels' ids                  labels.check_ids                             colours, mixed, snow
 15  ... and classes              labels.check_never_from_the_picture          colours, snow
 15  ... ignored grows            labels.check_ignored_grows                   re-roll, turns back
@@ -53,7 +57,7 @@ HERE = Path(__file__).parent
 
 
 def test_every_number_has_a_row():
-    assert {int(number) for number, _, _ in ROWS} == {*range(1, 14), 15, 16}
+    assert {int(number) for number, _, _ in ROWS} == {*range(1, 17)}
 
 
 @pytest.mark.parametrize(("number", "file", "name"), ROWS)

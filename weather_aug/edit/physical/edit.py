@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ from weather_aug.clip.types import Camera, Frame, Window
 from weather_aug.colour import SRGB_LEVELS_LINEAR
 from weather_aug.edit.ambience import Ambience
 from weather_aug.edit.physical.dress import Geometry, dress
-from weather_aug.edit.physical.layer_rows import TABLE_STEPS
+from weather_aug.edit.physical.layer_rows import MOST_ROOT, TABLE_STEPS
 from weather_aug.edit.physical.layers import Layers
 from weather_aug.edit.physical.look import look_of
 from weather_aug.edit.physical.materials import material_table
@@ -60,14 +61,14 @@ def edited(
     dress(
         np.stack(cv2.split(part)),
         surface_of(frame),
-        layers.classes.reshape(-1),
+        _shared(layers.classes).reshape(-1),
         window,
         geometry_of(frame.camera, ambience.axes_world, layers.plane, labelled=labelled),
         look,
-        layers.tint,
+        _shared(layers.tint),
         _tone_tables(0.0 if "relight" in without else weather.overcast),
         material_table(labelled=labelled),
-        layers.maps.view(np.uint16),
+        _shared(layers.maps.view(np.uint16)),
         np.float32(layers.step),
         noise_tile(),
         out,
@@ -90,12 +91,22 @@ def geometry_of(camera: Camera, axes_world: Float64, plane: Float64, *, labelled
     return Geometry(*(np.float32(value) for value in values))
 
 
+def _shared(array: NDArray[Any]) -> Any:
+    """A read-only view, so that the kernel is compiled once for what may be written or not."""
+    view = np.ascontiguousarray(array).view(np.ndarray)[...]
+    view.flags.writeable = False
+    return view
+
+
 @lru_cache(maxsize=64)
 def _tone_tables(overcast: float) -> tuple[Float32, Float32, Float32]:
-    """Toned light by sRGB level (256,) and by square root of light (1024,), and the matrix."""
+    """Toned light by sRGB level (256,) and by square root of light (N,), and the matrix."""
     curve, matrix = tone(overcast)
-    root = np.linspace(0.0, 1.0, TABLE_STEPS)
-    by_root = np.interp(root**2, SRGB_LEVELS_LINEAR, curve)
+    light = np.linspace(0.0, MOST_ROOT, MOST_ROOT * TABLE_STEPS + 1) ** 2
+    # The tone is a power of light, so that its last two levels say how it goes on.
+    power = np.log(curve[-1] / curve[-2]) / np.log(SRGB_LEVELS_LINEAR[-1] / SRGB_LEVELS_LINEAR[-2])
+    inside = np.interp(light, SRGB_LEVELS_LINEAR, curve)
+    by_root = np.where(light > 1.0, curve[-1] * light**power, inside)
     tables = curve.astype(np.float32), by_root.astype(np.float32), matrix.astype(np.float32)
     for table in tables:
         table.flags.writeable = False

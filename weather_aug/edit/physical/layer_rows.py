@@ -8,7 +8,10 @@ from weather_aug._compiled import compiled, inlined
 from weather_aug.edit.physical.layers import ILLUMINATION, LUMINANCE_MEAN, ROUGH, SHARP
 
 TABLE_STEPS = 1024
-"""Of toned light, by the square root of light."""
+"""Of toned light up to 1, by the square root of light."""
+MOST_ROOT = 4
+"""The table ends at the square of this: a white surface in the sun is brighter than a picture's
+white, because the camera exposes for the whole street."""
 
 
 @compiled
@@ -18,7 +21,7 @@ def load_row(layers, cells, by_root, matrix, look, scratch, out):
     Args:
         layers: (20, h, w) uint16, bits of float16.
         cells: (row, first, last) which to load; the latter two unsigned, see `spread_run`.
-        by_root: (1024,) float32 toned light by the square root of light.
+        by_root: (N,) float32 toned light by the square root of light.
         matrix: (3, 3) float32 colour matrix after the tone.
         look: Weather.
         scratch: (4, w) float32.
@@ -70,9 +73,9 @@ def _mirrored(layers, base, cells, by_root, matrix, look, scratch, slot, out):
 
 @inlined
 def _toned(light, by_root):
-    last = np.float32(TABLE_STEPS - 1)
-    root = np.sqrt(max(light, np.float32(0.0))) * last
-    root = min(root, last)
-    step = min(np.int32(root), np.int32(TABLE_STEPS - 2))
+    last = MOST_ROOT * TABLE_STEPS
+    root = np.sqrt(max(light, np.float32(0.0))) * np.float32(TABLE_STEPS)
+    root = min(root, np.float32(last))
+    step = min(np.int32(root), np.int32(last - 1))
     low = by_root[step]
     return low + (root - np.float32(step)) * (by_root[step + np.int32(1)] - low)

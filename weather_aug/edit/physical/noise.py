@@ -109,7 +109,8 @@ def ground_noise(tile, along, left, footprint_m, offset):
         along: Metres.
         left: Metres.
         footprint_m: Size of the pixel on the ground: what is smaller is averaged.
-        offset: Metres.
+        offset: Metres at the fine look. At the coarse one, whose patches are larger than a few
+            metres, it is as many cells.
     """
     per_m = np.float32(1.0 / CELL_M)
     level = np.int32(0)
@@ -123,7 +124,8 @@ def ground_noise(tile, along, left, footprint_m, offset):
     turned_u = np.float32(_TURN[0]) * along + np.float32(_TURN[1]) * left
     turned_v = np.float32(_TURN[0]) * left - np.float32(_TURN[1]) * along
     slow = per_m * np.float32(1.0 / COARSER)
-    coarse = looked_up(tile, (turned_u - offset) * slow, (turned_v + offset) * slow, coarse_level)
+    aside = offset * per_m
+    coarse = looked_up(tile, turned_u * slow - aside, turned_v * slow + aside, coarse_level)
     return evened(np.float32(COARSE_SHARE) * coarse + np.float32(1.0 - COARSE_SHARE) * fine)
 
 

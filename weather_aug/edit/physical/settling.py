@@ -14,6 +14,7 @@ Float64 = NDArray[np.float64]
 
 FARTHEST_SIDE_M = 60.0
 ROUGH_M = 0.08
+LEAST_STEP_M = 1e-3
 
 
 def facing_up(site: Site) -> Float32:
@@ -39,14 +40,19 @@ def lateral_m(site: Site, path: Float64 | None) -> Float32:
     Args:
         site: The frame.
         path: (P, 2) places (along, left) of the camera in the order driven, street axes; None where
-            the way is unknown: then it goes straight ahead.
+            the way is unknown: then, as when the car was parked, it goes straight ahead.
     """
     places = _on_plane(site)
-    if path is None or len(path) < 2:
+    if path is None or not _steps(np.asarray(path, np.float64)).any():
         ahead = site.axes_world[:2] @ site.frame.camera.world_from_camera[:3, 2]
         ahead = ahead / max(float(np.hypot(*ahead)), 1e-6)
         path = site.origin[:2] + np.outer((0.0, 1.0), ahead)
     return _signed_distance(places, np.asarray(path, np.float64)).astype(np.float32)
+
+
+def _steps(path: Float64) -> NDArray[np.bool_]:
+    """(P - 1,) which steps of a path lead anywhere."""
+    return np.hypot(*np.diff(path, axis=0).T) > LEAST_STEP_M
 
 
 def _on_plane(site: Site) -> Float64:
@@ -60,12 +66,9 @@ def _on_plane(site: Site) -> Float64:
 
 def _signed_distance(places: Float64, path: Float64) -> Float64:
     """Signed distance (h, w), left positive, from a polyline whose ends go on for ever."""
-    starts, steps = path[:-1], np.diff(path, axis=0)
+    kept = _steps(path)
+    starts, steps = path[:-1][kept], np.diff(path, axis=0)[kept]
     lengths = np.hypot(*steps.T)
-    kept = lengths > 1e-3
-    starts, steps, lengths = starts[kept], steps[kept], lengths[kept]
-    if not len(starts):
-        return np.zeros(places.shape[:2])
     best = np.full(places.shape[:2], np.inf)
     signed = np.zeros(places.shape[:2])
     for index, (start, step, length) in enumerate(zip(starts, steps, lengths, strict=True)):

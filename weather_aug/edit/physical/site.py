@@ -31,6 +31,9 @@ CELLS_ACROSS = 320
 PLANE_RANGE_M = (3.0, 40.0)
 PLANE_SIDE_M = 8.0
 PLANE_ROUNDS = 4
+WIDE_ROUNDS = (6.0, 4.0, 2.0, 1.0, 1.0)
+SURE_SHARE = 0.7
+"""Of the road's points; a plane through fewer may be the wrong one."""
 PLANE_TOLERANCE_M = 0.15
 STEEPEST_SLOPE = 0.12
 LEAST_PLANE_POINTS = 60
@@ -193,19 +196,37 @@ def _road_plane(frame: Frame, axes_world: Float64, camera_height_m: float) -> Fl
         picked &= _centres(frame.label, step) == ROAD
     points = offset[picked]
     level = np.array([-camera_height_m, 0.0, 0.0])
-    fitted = level
+    fitted, on_it = _fitted_plane(points, level, (1.0,) * PLANE_ROUNDS)
+    if on_it < SURE_SHARE * len(points):
+        # A road that climbs leaves the level's neighbourhood within metres.
+        steep, on_steep = _fitted_plane(points, level, WIDE_ROUNDS)
+        fitted = steep if on_steep > on_it else fitted
+    return _through_origin(fitted, origin)
+
+
+def _fitted_plane(
+    points: Float64, level: Float64, rounds: tuple[float, ...]
+) -> tuple[Float64, int]:
+    """Plane (3,) through points (N, 3), and how many lie on it; `level` and 0 where few do.
+
+    Each round fits what lies near the plane of the round before: nearer than the tolerance times
+    the round's number.
+    """
+    fitted, reach = level, np.hypot(points[:, 0], points[:, 1])
+    tolerance = PLANE_TOLERANCE_M + 0.02 * reach
     # Far points say more of the slope than of the height, and are noisier.
-    weight = 1.0 / (5.0 + np.hypot(points[:, 0], points[:, 1]))
-    for _ in range(PLANE_ROUNDS):
+    weight = 1.0 / (5.0 + reach)
+    for widened in rounds:
         off = points[:, 2] - fitted[0] - points[:, :2] @ fitted[1:]
-        kept = np.abs(off) < PLANE_TOLERANCE_M + 0.02 * np.hypot(points[:, 0], points[:, 1])
+        kept = np.abs(off) < widened * tolerance
         if kept.sum() < LEAST_PLANE_POINTS:
-            return _through_origin(level, origin)
+            return level, 0
         design = np.column_stack([np.ones(kept.sum()), points[kept, :2]]) * weight[kept, None]
         fitted = np.linalg.lstsq(design, points[kept, 2] * weight[kept], rcond=None)[0]
         if np.abs(fitted[1:]).max() > STEEPEST_SLOPE or not 0.3 < -fitted[0] < 5.0:
-            return _through_origin(level, origin)
-    return _through_origin(fitted, origin)
+            return level, 0
+    off = points[:, 2] - fitted[0] - points[:, :2] @ fitted[1:]
+    return fitted, int((np.abs(off) < tolerance).sum())
 
 
 def _through_origin(plane: Float64, origin: Float64) -> Float64:

@@ -78,7 +78,7 @@ def test_the_way_from_clip_to_pictures(
     out = capsys.readouterr().out.splitlines()
     assert out[0] == f"scene {scene.name}, digest {scene.digest[:12]}, editor physical"
     assert out[1] == "3 frames (3 labelled) of left, front, right"
-    assert out[2].startswith("9 files, ")
+    assert out[2].startswith("18 files, ")
     assert out[3] == "every file is whole"
 
 

@@ -21,6 +21,8 @@ from weather_aug.render import compose, fields, stage
 STAGES: dict[str, tuple[Any, str]] = {
     "read": (compose, "surface_of"),
     "air": (compose, "air_of"),
+    "look at the frame": (compose, "looked_at"),
+    "background": (compose, "background_of"),
     "resolve": (ParticleField, "resolve"),
     "enumerate": (ParticleField, "particles"),
     "shelter": (fields, "exposed"),
@@ -29,6 +31,7 @@ STAGES: dict[str, tuple[Any, str]] = {
     "split": (stage, "split_by_band"),
     "shade": (stage, "shade"),
     "merge": (cv2, "merge"),
+    "glass and sensor": (compose, "taken"),
     "labels": (compose, "readable_labels"),
 }
 """Functions whose time is taken where `render` looks them up; the first are called first."""

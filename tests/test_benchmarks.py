@@ -9,7 +9,7 @@ from benchmarks.drawn import fragments
 from benchmarks.growth import fitted_power
 from benchmarks.overlays import COPY, FAR_COPY, ratios
 from benchmarks.report import Row
-from benchmarks.stages import StageClock
+from benchmarks.stages import STAGES, StageClock
 
 
 @pytest.mark.parametrize(
@@ -72,6 +72,12 @@ def test_fragments_are_the_pixels_inside_the_ellipses():
         expected += int((a * dx**2 + 2 * b * dx * dy + c * dy**2 <= reach2).sum())
     assert expected > 500
     assert abs(expected - fragments(splats, height, width)) <= 2  # float32 at the ellipses' rims
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_a_stage_is_a_function_of_the_renderer(name):
+    owner, attribute = STAGES[name]
+    assert callable(getattr(owner, attribute))
 
 
 def test_time_inside_an_inner_stage_is_not_counted_twice():

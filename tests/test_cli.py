@@ -18,9 +18,11 @@ from tiny_clip import digests_of
 import weather_aug
 from weather_aug.cli import Export, main, parsed_types
 from weather_aug.clip.types import FrameKey
+from weather_aug.render.options import RenderOptions
 from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.timeline import WeatherTimeline
+from weather_aug.view.sheet import states
 from weather_aug.view.video import drive_frames, parked_frames
 from weather_aug.weather import Weather
 
@@ -92,6 +94,46 @@ def test_render_takes_one_camera_and_what_the_weather_left(
     expected = scene.render(scene.keys[1], Weather.rain("heavy", falling=False)).image
     assert np.array_equal(cv2.imread(str(out / "000000_right.png"), cv2.IMREAD_COLOR_RGB), expected)
     assert len(list(out.iterdir())) == 4
+
+
+def test_render_takes_two_weathers_at_once_and_leaves_effects_out(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = WeatherScene.load(folder)
+    options = RenderOptions(without=("mirror", "noise"))
+    for flags, falling in (("", True), (" --no-falling", False)):
+        out = tmp_path / f"pictures{falling}"
+        command = f"render {folder} --weather rain+fog --without noise mirror --camera front"
+        main(f"{command}{flags} --out {out}".split())
+        both = Weather.mix(Weather.rain("heavy", falling=falling), Weather.fog("heavy"))
+        expected = scene.render(scene.keys[0], both, options=options).image
+        assert np.array_equal(frames_in(out)[0], expected)
+        assert (scene.render(scene.keys[0], both).image != expected).any()
+    capsys.readouterr()
+    for flags, says in (
+        ("--weather rain+hail", "'hail'"),
+        ("--weather clear+fog --no-falling", "does not fall"),
+        ("--without rainbows", "'rainbows'"),
+    ):
+        code, line = refused(f"render {folder} {flags} --out {tmp_path / 'no'}".split(), capsys)
+        assert (code, says in line) == (2, True), line
+    assert not (tmp_path / "no").exists()
+
+
+def test_sweep_shows_states_and_leaves_effects_out(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = WeatherScene.load(folder)
+    key = FrameKey(1, "right")
+    where = f"sweep {folder} --camera right --time 1 --tile-width 64 --out {tmp_path / 'a.png'}"
+    main([*f"{where} --states --without lamps drops".split()])
+    written = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_COLOR_RGB)
+    options = RenderOptions(without=("lamps", "drops"))
+    assert np.array_equal(written, states(scene, key, tile_width=64, options=options))
+    assert not np.array_equal(written, states(scene, key, tile_width=64))
+    capsys.readouterr()
+    code, line = refused(f"{where} --without rainbows".split(), capsys)
+    assert (code, "'rainbows'" in line) == (2, True)
 
 
 def test_render_writes_invalid_masks_without_labels(
@@ -537,7 +579,7 @@ def test_the_demo_ends_with_a_sheet(tmp_path: Path, capsys: pytest.CaptureFixtur
     for _ in range(2):
         main(f"demo --out {out} --frames 1 --width 320".split())
         lines = capsys.readouterr().out.splitlines()
-        assert lines[-1] == str(out / "contact_sheet.png")
+        assert lines[-2:] == [str(out / name) for name in ("states.png", "contact_sheet.png")]
         trees.append(digests_of(out))
     assert trees[0] == trees[1]
     sheet = cv2.imread(lines[-1])

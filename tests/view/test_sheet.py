@@ -14,14 +14,18 @@ from numpy.typing import NDArray
 from weather_aug.air import Air
 from weather_aug.clip.types import FrameKey
 from weather_aug.errors import ArgumentError, OutputError
+from weather_aug.render.options import RenderOptions
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.taxonomy import PALETTE, coloured
 from weather_aug.timeline import WeatherTimeline
+from weather_aug.view import sheet as sheets
 from weather_aug.view.sheet import (
+    STATES,
     contact_sheet,
     grid,
     left_to_right,
     rig_still,
+    states,
     sweep,
     transmittance_picture,
     write_png,
@@ -146,19 +150,91 @@ def test_a_sweep_of_nothing_known_is_refused(
 def test_a_contact_sheet_shows_label_and_transmittance_below(tiny_scene: WeatherScene) -> None:
     keys = tiny_scene.keys[:2]
     sheet = contact_sheet(tiny_scene, keys, severities=("heavy",), tile_width=64)
-    assert sheet.shape == (HEADER + 6 * (48 + MARGIN), HEADER + 4 * (64 + MARGIN), 3)
-    weather = Weather.snow("heavy")
-    shot = tiny_scene.render(keys[1], weather, air=Air.held(weather))
-    assert shot.label is not None
-    assert (tile(sheet, 3, 2) == shot.image).all()
-    assert (tile(sheet, 4, 2) == coloured(shot.label)).all()
-    assert (tile(sheet, 5, 2) == transmittance_picture(shot.transmittance)).all()
+    columns = ["clear", *STATES, "rain", "snow", "fog"]
+    assert sheet.shape == (HEADER + 6 * (48 + MARGIN), HEADER + 8 * (64 + MARGIN), 3)
+    assert (tile(sheet, 0, 0) == tiny_scene.frame(keys[0]).image).all()
+    weathers = {"snow": Weather.snow("heavy"), "fresh snow, clear air": None}
+    for name, weather in weathers.items():
+        weather = weather or STATES[name]
+        shot = tiny_scene.render(keys[1], weather, air=Air.held(weather))
+        assert shot.label is not None
+        column = columns.index(name)
+        assert (tile(sheet, 3, column) == shot.image).all()
+        assert (tile(sheet, 4, column) == coloured(shot.label)).all()
+        assert (tile(sheet, 5, column) == transmittance_picture(shot.transmittance)).all()
 
 
 def test_a_contact_sheet_without_labels_has_no_row_for_them(unlabelled_scene: WeatherScene) -> None:
     keys = unlabelled_scene.keys[:1]
     sheet = contact_sheet(unlabelled_scene, keys, severities=("heavy",), tile_width=64)
     assert sheet.shape[0] == HEADER + 2 * (48 + MARGIN)
+
+
+def state_tile(sheet: UInt8, row: int, column: int) -> UInt8:
+    """A picture of a sheet of states, whose rows have a heading each."""
+    return tile(sheet[row * (HEADER + 48 + MARGIN) :], 0, column)
+
+
+def check_states(scene: WeatherScene) -> None:
+    """The recorded frame, the four states in order, and what the fog leaves of the label."""
+    key = scene.keys[2]
+    sheet = states(scene, key, seed=3, tile_width=64)
+    assert sheet.shape == (2 * (HEADER + 48 + MARGIN), HEADER + 3 * (64 + MARGIN), 3)
+    assert (state_tile(sheet, 0, 0) == scene.frame(key).image).all()
+    places = ((0, 1), (0, 2), (1, 0), (1, 1))
+    shots = [scene.render(key, w, seed=3, air=Air.held(w)) for w in STATES.values()]
+    for place, shot in zip(places, shots, strict=True):
+        assert (state_tile(sheet, *place) == shot.image).all(), place
+    left = shots[2]
+    painted = (
+        transmittance_picture(left.transmittance) if left.label is None else coloured(left.label)
+    )
+    assert (state_tile(sheet, 1, 2) == painted).all()
+
+
+def test_states_stand_in_their_places(
+    tiny_scene: WeatherScene, unlabelled_scene: WeatherScene
+) -> None:
+    check_states(tiny_scene)
+    check_states(unlabelled_scene)
+
+
+def test_pictures_in_wrong_places_would_be_seen(
+    tiny_scene: WeatherScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sheets, "STATES", dict(reversed(STATES.items())))
+    with pytest.raises(AssertionError):
+        check_states(tiny_scene)
+
+
+def test_the_states_are_those_of_ground_air_and_glass() -> None:
+    wet, snow, fog, glass = STATES.values()
+    assert (wet.wetness, wet.rain_mm_per_h, wet.lens_drops) == (1.0, 0.0, 0.0)
+    assert (snow.snow_mm_per_h, snow.mist_per_km) == (0.0, 0.0)
+    assert snow.snow_cover >= 0.9
+    assert snow.visibility_m == np.inf
+    assert fog.visibility_m < 100
+    assert fog.lamps == 1.0
+    assert glass.rain_mm_per_h >= 20
+    assert glass.lens_drops > Weather.rain("heavy").lens_drops
+
+
+def test_sheets_pass_options_on(tiny_scene: WeatherScene) -> None:
+    key = tiny_scene.keys[0]
+    bare = RenderOptions(without=("relight", "sky", "film", "mirror", "puddles", "exposure"))
+    weather = Weather.rain("heavy", falling=False)
+    expected = tiny_scene.render(key, weather, air=Air.held(weather), options=bare).image
+    assert (
+        state_tile(states(tiny_scene, key, tile_width=64, options=bare), 0, 1) == expected
+    ).all()
+    keyed = contact_sheet(tiny_scene, [key], severities=(), tile_width=64, options=bare)
+    assert (tile(keyed, 0, 1) == expected).all()
+    fog = Weather.fog(0.3)
+    expected = tiny_scene.render(key, fog, air=Air.held(fog), options=bare).image
+    swept = sweep(tiny_scene, key, kinds=["fog"], severities=[0.3], tile_width=64, options=bare)
+    assert (tile(swept, 0, 1) == expected).all()
+    plain_sweep = sweep(tiny_scene, key, kinds=["fog"], severities=[0.3], tile_width=64)
+    assert (plain_sweep != swept).any()
 
 
 def test_a_rig_still_shows_all_cameras_of_a_moment(tiny_scene: WeatherScene) -> None:

@@ -27,6 +27,8 @@ from weather_aug.taxonomy import IGNORE
 
 DEMO_WIDTH_PX = (32, 4096)
 """Narrower, a picture of nine sixteenths its width has too few rows for the street."""
+DEMO_STREET = 3
+"""Seed of a street on which a car comes with its lamps on in the middle of the drive."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class Build:
 
 @dataclass(frozen=True)
 class Sweep:
-    """Make one labelled picture of all weathers and severities."""
+    """Make one labelled picture of all weathers and severities, or of four states."""
 
     scene: Positional[Path]
     """Scene folder."""
@@ -77,13 +79,20 @@ class Sweep:
     """Which particles fall."""
     tile_width: int = 480
     """Width of each picture, pixels."""
+    states: bool = False
+    """Show a wet road without rain, fresh snow under clear air, dense fog with lamps, and heavy
+    rain through wet glass instead."""
+    without: tuple[str, ...] = ()
+    """Effects to leave out, such as mirror lamps drops; see `RenderOptions.without`."""
 
     def run(self) -> None:
         """Render the grid and name its file."""
         from weather_aug.clip.types import FrameKey
+        from weather_aug.render.options import RenderOptions
         from weather_aug.scene.scene import WeatherScene
-        from weather_aug.view.sheet import sweep, write_png
+        from weather_aug.view.sheet import states, sweep, write_png
 
+        options = RenderOptions(without=self.without)
         scene = WeatherScene.load(self.scene)
         camera = self.camera or scene.cameras[0]
         times = [k.time_index for k in scene.keys if k.camera == camera]
@@ -94,7 +103,9 @@ class Sweep:
             )
         time_index = times[len(times) // 2] if self.time is None else self.time
         key = FrameKey(time_index, camera)
-        write_png(self.out, sweep(scene, key, seed=self.seed, tile_width=self.tile_width))
+        draw = states if self.states else sweep
+        sheet = draw(scene, key, seed=self.seed, tile_width=self.tile_width, options=options)
+        write_png(self.out, sheet)
         say(str(self.out))
 
 
@@ -108,7 +119,7 @@ class Export:
     """Folder of the data set."""
     count: int = 1000
     """Samples to write."""
-    types: tuple[str, ...] = ("clear=1", "rain=2", "snow=2", "fog=1")
+    types: tuple[str, ...] = ("clear=1", "rain=1", "snow=1", "fog=1")
     """Weather types and how often each is drawn, "type=weight"; "rain+fog=1" is both at once."""
     severity: tuple[float, float] = (0.1, 1.0)
     """Range of severities."""
@@ -174,31 +185,36 @@ class Demo:
         from weather_aug.clip.open import open_clip
         from weather_aug.scene.scene import WeatherScene
         from weather_aug.transforms.dataset import WeatherDataset
-        from weather_aug.view.sheet import contact_sheet, write_png
+        from weather_aug.view.sheet import contact_sheet, states, write_png
 
         start = time.perf_counter()
         low, high = DEMO_WIDTH_PX
         if not low <= self.width <= high:
             raise ArgumentError(f"width must be in [{low}, {high}] pixels, got {self.width}")
         height = self.width * 9 // 16
-        clip = open_clip(f"street:?frames={self.frames}&width={self.width}&height={height}")
+        clip = open_clip(
+            f"street:?seed={DEMO_STREET}&frames={self.frames}&width={self.width}&height={height}"
+        )
         check_folder(self.out)
         say("1/3 build a scene of the procedural street, three cameras (the first run compiles)")
         with _files.reported(self.out):
             self.out.mkdir(parents=True, exist_ok=True)
         scene = WeatherScene.build(clip, self.out / "scene", progress=to_people(), overwrite=True)
         say("2/3 draw weather on the fly, as a training loop does")
-        dataset = WeatherDataset([scene], seed=1)
+        dataset = WeatherDataset([scene], seed=10)
         for index in range(0, len(dataset), max(1, len(dataset) // 3)):
             sample = dataset[index]
             ignored = (sample["label"] == IGNORE).float().mean()
             say(f"    {_state(sample['recipe'])}; {ignored:.1%} of the label ignored")
-        say("3/3 render rain, snow and fog at three severities")
+        say("3/3 render four states of the street, then rain, snow and fog by severity")
         middle = scene.keys[len(scene.keys) // 2].time_index
         keys = [key for key in scene.keys if key.time_index == middle]
+        front = next(key for key in keys if key.camera == "front")
+        write_png(self.out / "states.png", states(scene, front))
         sheet = self.out / "contact_sheet.png"
         write_png(sheet, contact_sheet(scene, keys))
         say(f"done in {time.perf_counter() - start:.0f} s; look at")
+        say(str(self.out / "states.png"))
         say(str(sheet))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import reduce
 from pathlib import Path
 from typing import Annotated
 
@@ -24,7 +25,7 @@ class Render:
     scene: Positional[Path]
     """Scene folder."""
     weather: str = "rain"
-    """Weather type: clear, rain, snow, fog."""
+    """Weather type: clear, rain, snow, fog, or two at once, such as rain+fog."""
     severity: str = "heavy"
     """light, moderate, heavy, extreme, or a number in [0, 1]."""
     falling: bool = True
@@ -55,6 +56,8 @@ class Render:
     """Which particles fall."""
     max_particles: int = 20_000
     """Expected number of resolved particles in a picture at the most."""
+    without: tuple[str, ...] = ()
+    """Effects to leave out, such as mirror lamps drops; see `RenderOptions.without`."""
     labels: bool = False
     """Write the invalid masks too, and the remapped labels where there are labels."""
 
@@ -75,7 +78,7 @@ class Render:
         from weather_aug.view.sheet import write_png
         from weather_aug.view.video import keys_of, shown_s
 
-        options = RenderOptions(self.max_particles)
+        options = RenderOptions(self.max_particles, without=self.without)
         check_folder(self.out)
         scene = WeatherScene.load(self.scene)
         keys = scene.keys if self.camera is None else keys_of(scene, self.camera)
@@ -101,7 +104,7 @@ class Render:
         from weather_aug.scene.scene import WeatherScene
         from weather_aug.view import video
 
-        options = RenderOptions(self.max_particles)
+        options = RenderOptions(self.max_particles, without=self.without)
         video.check_video_path(path)
         scene = WeatherScene.load(self.scene)
         camera = self.camera or scene.cameras[0]
@@ -154,16 +157,15 @@ class Render:
 
     def _ends(self) -> tuple[Weather, Weather]:
         """The weather that there was first, and the one after."""
-        from weather_aug.scene.policy import weather_of
-
         severity = parse_severity(_severity(self.severity))
-        weather = weather_of(self.weather, severity, falling=self.falling)
-        if not self.falling and self.weather not in ("rain", "snow"):
+        weather = _weather_of(self.weather, severity, self.falling)
+        if not self.falling and not {"rain", "snow"} & set(self.weather.split("+")):
             raise ArgumentError(
                 f"--no-falling is for rain and snow, which leave something behind; {self.weather} "
                 "does not fall"
             )
-        return (weather if self.origin is None else weather_of(self.origin, severity)), weather
+        before = weather if self.origin is None else _weather_of(self.origin, severity, True)
+        return before, weather
 
 
 _NEEDS = {
@@ -177,6 +179,14 @@ _AGAINST = {
     "video": {"out", "labels"},
     "timeline": {"weather", "severity", "falling", "origin", "start_s", "end_s"},
 }
+
+
+def _weather_of(kinds: str, severity: float, falling: bool) -> Weather:
+    """The weather of a type, or of several at once with "+" between them."""
+    from weather_aug.scene.policy import weather_of
+
+    parts = [weather_of(kind, severity, falling=falling) for kind in kinds.split("+")]
+    return reduce(Weather.mix, parts)
 
 
 def _flag(name: str) -> str:

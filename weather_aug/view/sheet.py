@@ -1,4 +1,4 @@
-"""Sheets of labelled pictures: severity sweeps, contact sheets, all cameras of a moment."""
+"""Sheets of labelled pictures: sweeps, states, contact sheets, all cameras of a moment."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from weather_aug.air import Air
 from weather_aug.clip.types import FrameKey
 from weather_aug.errors import ArgumentError
 from weather_aug.render.compose import RenderedFrame
+from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene.policy import weather_of
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.taxonomy import coloured
@@ -27,6 +28,15 @@ UInt8 = NDArray[np.uint8]
 
 KINDS = ("rain", "snow", "fog")
 SEVERITIES = ("light", "moderate", "heavy", "extreme")
+STATES = {
+    "wet road, no rain": Weather.rain("heavy", falling=False, puddles=0.45),
+    "fresh snow, clear air": Weather.snow(
+        "heavy", falling=False, road_snow_cover=0.75, snow_depth_m=0.12
+    ),
+    "dense fog, lamps on": Weather.fog(visibility_m=70.0, lamps=1.0),
+    "heavy rain, wet glass": Weather.rain("heavy", lens_drops=90.0, wipers=0.0),
+}
+"""What a filter over the picture cannot draw: light, ground, air, and the glass before the lens."""
 _MARGIN_PX = 4
 _HEADER_PX = 26
 _PAPER, _INK = 250, 30
@@ -40,6 +50,7 @@ def sweep(
     severities: Sequence[str | float] = SEVERITIES,
     seed: int = 0,
     tile_width: int = 480,
+    options: RenderOptions = DEFAULT_OPTIONS,
 ) -> UInt8:
     """One labelled picture: a row per weather, a column per severity, the clear frame first.
 
@@ -50,28 +61,69 @@ def sweep(
         severities: Names or numbers in [0, 1].
         seed: Of the particles.
         tile_width: Width of each picture, pixels.
+        options: Choices besides the weather.
 
     Returns:
         (H, W, 3) uint8.
     """
-    key = key or scene.keys[len(scene.keys) // 2]
-    clear = scene.render(key, weather_of("clear", 0.0), seed=seed).image
+    key = key or _middle(scene)
+    clear = scene.render(key, Weather.clear(), seed=seed).image
     rows = []
     for kind in kinds:
-        shots = [_shot(scene, key, weather_of(kind, s), seed).image for s in severities]
+        shots = [_shot(scene, key, weather_of(kind, s), seed, options).image for s in severities]
         rows.append([clear, *shots])
     return grid(rows, kinds, ["clear", *(str(s) for s in severities)], tile_width)
+
+
+def states(
+    scene: WeatherScene,
+    key: FrameKey | None = None,
+    *,
+    seed: int = 0,
+    tile_width: int = 640,
+    options: RenderOptions = DEFAULT_OPTIONS,
+) -> UInt8:
+    """One frame as recorded and in the four weathers of `STATES`, three by two.
+
+    The sixth picture is what the fog leaves of the label, or the transmittance where nobody
+    labelled.
+
+    Args:
+        scene: Scene to render from.
+        key: Which frame; the middle one if None.
+        seed: Of the particles.
+        tile_width: Width of each picture, pixels.
+        options: Choices besides the weather.
+
+    Returns:
+        (H, W, 3) uint8.
+    """
+    key = key or _middle(scene)
+    shots = {name: _shot(scene, key, w, seed, options) for name, w in STATES.items()}
+    pictures = {"recorded": scene.frame(key).image}
+    pictures |= {name: shot.image for name, shot in shots.items()}
+    fog = shots["dense fog, lamps on"]
+    if fog.label is None:
+        pictures["transmittance of the fog"] = transmittance_picture(fog.transmittance)
+    else:
+        pictures["label in the fog, black is ignored"] = coloured(fog.label)
+    names = list(pictures)
+    halves = (names[:3], names[3:])
+    return np.concatenate(
+        [grid([[pictures[name] for name in half]], [""], half, tile_width) for half in halves]
+    )
 
 
 def contact_sheet(
     scene: WeatherScene,
     keys: Sequence[FrameKey],
     *,
-    severities: Sequence[str | float] = SEVERITIES[:3],
+    severities: Sequence[str | float] = ("light", "heavy"),
     seed: int = 0,
     tile_width: int = 480,
+    options: RenderOptions = DEFAULT_OPTIONS,
 ) -> UInt8:
-    """Every weather and severity of some frames, with label and transmittance below each picture.
+    """The states and severities of some frames, with label and transmittance below each picture.
 
     Args:
         scene: Scene to render from.
@@ -79,15 +131,17 @@ def contact_sheet(
         severities: Names or numbers in [0, 1].
         seed: Of the particles.
         tile_width: Width of each picture, pixels.
+        options: Choices besides the weather.
 
     Returns:
-        (H, W, 3) uint8.
+        (H, W, 3) uint8; columns are clear, `STATES`, then each of `KINDS` at each severity.
     """
-    states = [("clear", 0.0), *((kind, s) for kind in KINDS for s in severities)]
+    weathers = {"clear": Weather.clear(), **STATES}
+    weathers |= {f"{s} {kind}": weather_of(kind, s) for kind in KINDS for s in severities}
     rows: list[list[UInt8]] = []
     names: list[str] = []
     for key in keys:
-        shots = [_shot(scene, key, weather_of(kind, s), seed) for kind, s in states]
+        shots = [_shot(scene, key, w, seed, options) for w in weathers.values()]
         rows.append([shot.image for shot in shots])
         names.append(key.camera)
         if shots[0].label is not None:
@@ -95,8 +149,7 @@ def contact_sheet(
             names.append("label")
         rows.append([transmittance_picture(shot.transmittance) for shot in shots])
         names.append("transmittance")
-    columns = ["clear", *(f"{s} {kind}" for kind, s in states[1:])]
-    return grid(rows, names, columns, tile_width)
+    return grid(rows, names, list(weathers), tile_width)
 
 
 def rig_still(
@@ -209,9 +262,15 @@ def write_png(path: Path, image: UInt8) -> None:
     _files.write_whole(path, png)
 
 
-def _shot(scene: WeatherScene, key: FrameKey, weather: Weather, seed: int) -> RenderedFrame:
+def _middle(scene: WeatherScene) -> FrameKey:
+    return scene.keys[len(scene.keys) // 2]
+
+
+def _shot(
+    scene: WeatherScene, key: FrameKey, weather: Weather, seed: int, options: RenderOptions
+) -> RenderedFrame:
     """One picture of a sheet; the air has drifted alike in all, so that drops stay."""
-    return scene.render(key, weather, seed=seed, air=Air.held(weather))
+    return scene.render(key, weather, seed=seed, air=Air.held(weather), options=options)
 
 
 def _label(shot: RenderedFrame) -> UInt8:

@@ -1,14 +1,16 @@
 """The torch renderer against the compiled one at 512 x 1024; on CUDA too where there is one.
 
 `python -m benchmarks.batch`. "batch" draws particles with the compiled kernels, as it does on a CPU
-if not told otherwise; "torch" with torch alone. On a CPU `render` is the one to use; a batch is for
-pictures that live on a GPU and for gradients.
+if not told otherwise; "torch" with torch alone. All draw what a batch draws (no lamps, glass and
+sensor) and are given what the editor knows of the picture, as from a scene. On a CPU `render` is
+the one to use; a batch is for pictures that live on a GPU and for gradients.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -18,7 +20,9 @@ from benchmarks.scene import street
 from benchmarks.timing import interleaved
 from weather_aug.clip.types import Frame
 from weather_aug.edit.ambience import Ambience
-from weather_aug.render.batch import RenderedBatch, render_batch
+from weather_aug.edit.physical.layers import Layers
+from weather_aug.render.background import looked_at
+from weather_aug.render.batch import BATCH_OPTIONS, RenderedBatch, render_batch
 from weather_aug.render.compose import render
 from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
@@ -30,12 +34,14 @@ def main() -> None:
     """Print milliseconds a frame and their ratios to the compiled renderer."""
     torch.set_num_threads(1)
     frame, ambience = street(HEIGHT, WIDTH)
+    layers = looked_at(frame, ambience)
     print(f"\n{HEIGHT} x {WIDTH}, one core, medians of interleaved rounds, ms a frame")
     for name, (weather, count) in CASES.items():
-        options = RenderOptions(count)
-        batch = partial(_batch, frame, weather, ambience, options)
+        options = replace(BATCH_OPTIONS, max_particles=count)
+        batch = partial(_batch, frame, layers, weather, ambience, options)
+        alone = {"ambience": ambience, "layers": layers, "options": options}
         runs: dict[str, Callable[[], object]] = {
-            "render": partial(render, frame, weather, seed=1, ambience=ambience, options=options),
+            "render": partial(render, frame, weather, seed=1, **alone),
             "batch": batch("cpu", 1),
             "torch": batch("cpu", 1, splatting="torch"),
         }
@@ -53,6 +59,7 @@ def main() -> None:
 
 def _batch(
     frame: Frame,
+    layers: Layers,
     weather: Weather,
     ambience: Ambience,
     options: RenderOptions,
@@ -72,6 +79,7 @@ def _batch(
         seeds=[1] * count,
         ambiences=[ambience] * count,
         times_s=[frame.time_s] * count,
+        layers=[layers] * count,
         labels=labels,
         options=options,
         splatting=splatting,

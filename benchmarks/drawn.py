@@ -35,7 +35,8 @@ def drawn(run: Callable[[], object], height: int, width: int) -> Drawn:
 
     with patch.object(stage, "splats_of", watched):
         run()
-    splats = seen[-1]
+    # What glass and lens see of the whole, shrunk, is drawn after it.
+    splats = seen[0]
     # The parts of a streak follow each other and share shape and depth.
     new = (np.diff(splats[:, CONIC:LIGHT], axis=0) != 0).any(axis=1)
     particles = int(new.sum()) + 1 if len(splats) else 0

@@ -12,30 +12,35 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from weather_aug.clip.types import Camera, Frame, FrameKey
+from weather_aug.clip.types import Box, Camera, Frame, FrameKey
 from weather_aug.edit.ambience import ambience_of
 from weather_aug.edit.surface import Surface, depth_of
 from weather_aug.particles.shelter import Shelter
 from weather_aug.render import stage
 from weather_aug.render.compose import RenderedFrame, render
 from weather_aug.render.fields import RigMotion
-from weather_aug.render.options import RenderOptions
-from weather_aug.taxonomy import BUILDING, ROAD, SKY
+from weather_aug.render.lens_wiper import CROSSING, wiper_of
+from weather_aug.render.options import EFFECTS, RenderOptions
+from weather_aug.taxonomy import BUILDING, ROAD, SKY, TRAIN_ID
 from weather_aug.weather import Weather
 
 HEIGHT, WIDTH, FOCAL_PX = 120, 208, 160.0
 PLANES = ("image", "label", "invalid", "transmittance")
 AXES = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+STREET = np.array([[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1.0]])
 SCATTERED = RenderOptions(multiple_scattering=True)
 PUBLISHED = RenderOptions(preset="weatheredit")
 PATCHY = {"fog_patchiness": 0.7, "fog_puffs": 0.3}
+WIPED = Weather.rain("extreme", wipers=1.0)
 
 CASES: dict[str, tuple[Weather, dict[str, Any]]] = {
     "rain": (Weather.rain("heavy", gustiness=0.4), {}),
@@ -53,11 +58,31 @@ CASES: dict[str, tuple[Weather, dict[str, Any]]] = {
     "published-fog": (Weather.fog("heavy"), {"options": PUBLISHED}),
     "carried": (Weather.snow("heavy"), {"options": RenderOptions(alignment="camera")}),
     "few": (Weather.rain("extreme"), {"options": RenderOptions(max_particles=300)}),
+    "air-only": (Weather.rain("heavy"), {"options": RenderOptions(without=EFFECTS)}),
+    "wet-road": (Weather.rain("extreme", falling=False), {"traffic": True}),
+    "snowed-road": (Weather.snow("heavy", falling=False), {"traffic": True}),
+    "traffic": (Weather.rain("heavy"), {"traffic": True, "moment": 0.5}),
+    "wiped": (WIPED, {"moment": 3.0}),
+    "unlabelled": (WIPED, {"traffic": True, "labelled": False, "moment": 0.5}),
+    "half": (Weather.snow("extreme"), {"precision": np.float16}),
 }
+"""Weathers, and what their frames and renders have besides.
+
+A "moment" is when a wiper's blade is in the picture (below 1) or has passed (above)."""
+SEED = 77
 
 
-def frame_of(turn_rad_per_s: float = 0.0) -> Frame:
-    """A road between walls under a sky, with texture; the camera drives and may turn."""
+def frame_of(
+    turn: float = 0.0,
+    *,
+    traffic: bool = False,
+    labelled: bool = True,
+    precision: Any = np.float32,
+) -> Frame:
+    """A road between walls under a sky, with texture, trees and a car, if asked for.
+
+    The camera drives and may turn, radians per second.
+    """
     rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.int64)
     texture = (rows * 7919 + columns * 104729 + rows * columns * 31) % 61
     base = np.stack([texture + 70, texture + 75, texture + 80], axis=-1)
@@ -69,6 +94,9 @@ def frame_of(turn_rad_per_s: float = 0.0) -> Frame:
     sky = (rows < HEIGHT // 2 - aside // 2) | ~np.isfinite(depth)
     label = np.where(sky, SKY, np.where(road < wall, ROAD, BUILDING)).astype(np.uint8)
     base[sky] += 90
+    if traffic:
+        label[(label == BUILDING) & (columns > WIDTH // 2)] = TRAIN_ID["vegetation"]
+        label[58:76, 92:114], depth[58:76, 92:114] = TRAIN_ID["car"], 12.0
     pose = np.eye(4)
     # A turn of the pose whose numbers are exact: 3-4-5.
     pose[:3, :3] = AXES @ np.array([[0.8, 0, -0.6], [0, 1, 0], [0.6, 0, 0.8]])
@@ -79,27 +107,48 @@ def frame_of(turn_rad_per_s: float = 0.0) -> Frame:
         WIDTH,
         HEIGHT,
         velocity_m_per_s=np.array([9.0, 3.0, 0.0]),
-        angular_velocity_rad_per_s=np.array([0.0, turn_rad_per_s, 0.1 * turn_rad_per_s]),
+        angular_velocity_rad_per_s=np.array([0.0, turn, 0.1 * turn]),
         exposure_s=1 / 64,
     )
-    depth = np.where(sky, np.inf, depth).astype(np.float32)
-    return Frame(FrameKey(0, "front"), 3.375, camera, base.astype(np.uint8), label, depth)
+    far = np.inf if precision == np.float32 else 65504.0
+    return Frame(
+        FrameKey(0, "front"),
+        3.375,
+        camera,
+        base.astype(np.uint8),
+        label if labelled else None,
+        np.where(sky, far, depth).astype(precision),
+        boxes=(_car(pose),) if traffic else (),
+    )
+
+
+def _car(world_from_camera: NDArray[np.float64]) -> Box:
+    """12 m ahead, driving down the street."""
+    pose = np.eye(4)
+    pose[:3, :3] = STREET.T
+    pose[:3, 3] = world_from_camera[:3, 3] + 12.0 * world_from_camera[:3, 2] - (0, 0, 0.75)
+    return Box(1, "car", pose, (4.5, 1.75, 1.5), 12.0 * STREET[0])
 
 
 def rendered(name: str) -> RenderedFrame:
     """Render one case."""
     weather, extra = CASES[name]
-    frame = frame_of(extra.get("turn", 0.0))
-    street = np.array([[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1.0]])
+    made = {key: extra[key] for key in ("turn", "traffic", "labelled", "precision") if key in extra}
+    frame = frame_of(**made)
+    if "moment" in extra:
+        wiper = wiper_of(WIPED, frame.camera, SEED, 0, 0.0)
+        assert wiper is not None
+        since_s = extra["moment"] * CROSSING * wiper.period_s
+        frame = replace(frame, time_s=wiper.start_s + since_s)
     first = np.eye(4)
     first[:3, :3], first[:3, 3] = AXES, (0.0, 0.0, 1.5)
     cover = np.where(np.arange(60)[:, None] % 20 < 8, 5.0, math.inf) * np.ones((60, 60))
-    roof = Shelter(cover.astype(np.float32), np.array([-10.0, -30.0, 0.0]), street)
+    roof = Shelter(cover.astype(np.float32), np.array([-10.0, -30.0, 0.0]), STREET)
     return render(
         frame,
         weather,
-        seed=77,
-        ambience=ambience_of(frame, street),
+        seed=SEED,
+        ambience=ambience_of(frame, STREET),
         shelter=roof if extra.get("shelter") else None,
         rig=RigMotion(first, frame.camera.world_from_camera),
         options=extra.get("options", RenderOptions()),
@@ -112,8 +161,9 @@ def digests(names: list[str]) -> dict[str, str]:
     for name in names:
         shot = rendered(name)
         for plane in PLANES:
-            data = getattr(shot, plane).tobytes()
-            found[f"{name}/{plane}"] = hashlib.sha256(data).hexdigest()
+            data = getattr(shot, plane)
+            if data is not None:
+                found[f"{name}/{plane}"] = hashlib.sha256(data.tobytes()).hexdigest()
     return found
 
 
@@ -173,7 +223,7 @@ def main() -> None:
     if arguments.save:
         shots = {name: rendered(name) for name in names}
         saved = {f"{n}/{p}": getattr(s, p) for n, s in shots.items() for p in PLANES}
-        np.savez(arguments.save, **saved)
+        np.savez(arguments.save, **{k: plane for k, plane in saved.items() if plane is not None})
     with fault() if arguments.fault else contextlib.nullcontext():
         planes = digests(names)
     print(json.dumps({"planes": planes, "canaries": canaries()}))  # noqa: T201

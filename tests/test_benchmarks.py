@@ -187,6 +187,12 @@ def test_fragments_are_the_pixels_inside_the_ellipses():
     assert abs(expected - fragments(splats, height, width)) <= 2  # float32 at the ellipses' rims
 
 
+@pytest.mark.parametrize("name", STAGES)
+def test_a_stage_is_a_function_of_the_renderer(name):
+    owner, attribute = STAGES[name]
+    assert callable(getattr(owner, attribute))
+
+
 def test_time_inside_an_inner_stage_is_not_counted_twice():
     def busy(seconds):
         end = time.thread_time() + seconds

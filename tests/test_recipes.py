@@ -12,6 +12,7 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 
+import weather_aug
 from weather_aug.clip.labelled import LabelledClip
 from weather_aug.clip.open import open_clip
 from weather_aug.errors import ArgumentError, MissingExtraError
@@ -51,6 +52,7 @@ def test_recipe_runs(recipe, tmp_path):
     done = subprocess.run(
         [sys.executable, str(recipe), *OPTIONS.get(recipe.stem, [])],
         cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(Path(weather_aug.__file__).parents[1])},
         capture_output=True,
         text=True,
         timeout=300,

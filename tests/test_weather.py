@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 from dataclasses import FrozenInstanceError, fields, replace
@@ -14,38 +13,11 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from weather_aug.errors import ArgumentError
-from weather_aug.severity import (
-    NAMED_SEVERITIES,
-    fog_severity,
-    parse_severity,
-    rain_severity,
-    snow_severity,
-    visibility_from_severity,
-)
+from weather_aug.severity import FALLING
 from weather_aug.weather import Weather, shape_ends
 
 GRID = [i / 100 for i in range(101)]
-STOPS = [0.25, 0.5, 0.75, 1.0]
 FACTORY = {"rain": Weather.rain, "snow": Weather.snow, "fog": Weather.fog}
-
-TABLE = {
-    ("rain", "rain_mm_per_h"): (1.5, 5, 20, 75),
-    ("rain", "mist_per_km"): (0.2, 0.6, 2.0, 5.0),
-    ("rain", "wetness"): (0.5, 0.8, 1, 1),
-    ("rain", "overcast"): (0.6, 0.8, 1, 1),
-    ("rain", "gustiness"): (0.3, 0.3, 0.3, 0.3),
-    ("rain", "spray_per_km"): (0.5, 2, 10, 25),
-    ("snow", "snow_mm_per_h"): (0.4, 1, 2, 4),
-    ("snow", "mist_per_km"): (0.3, 0.8, 2, 5),
-    ("snow", "snow_cover"): (0.25, 0.6, 0.9, 1),
-    ("snow", "overcast"): (0.6, 0.8, 1, 1),
-    ("snow", "gustiness"): (0.25, 0.25, 0.25, 0.25),
-    ("fog", "fog_per_m"): (0.005, 0.01, 0.02, 0.06),
-    ("fog", "overcast"): (0.6, 0.8, 1, 1),
-}
-"""Documented values at light, moderate, heavy, extreme."""
-
-POWER_BELOW = {("fog", "fog_per_m"): 1}
 
 unit = st.floats(0, 1)
 length_m = st.floats(1, 1e6) | st.just(math.inf)
@@ -58,7 +30,10 @@ weathers = st.builds(
     fog_scale_height_m=length_m,
     mist_per_km=st.floats(0, 100),
     wetness=unit,
+    puddles=unit,
     snow_cover=unit,
+    road_snow_cover=unit,
+    snow_depth_m=st.floats(0, 2),
     overcast=unit,
     wind_m_per_s=st.tuples(wind, wind, wind),
     gustiness=unit,
@@ -66,6 +41,9 @@ weathers = st.builds(
     fog_patchiness=unit,
     fog_puffs=st.floats(0, 0.5),
     spray_per_km=st.floats(0, 200),
+    lamps=unit,
+    lens_drops=st.floats(0, 500),
+    wipers=unit,
 )
 THING = {
     "snow_wetness": {"snow_mm_per_h": 1.0},
@@ -73,79 +51,8 @@ THING = {
     "fog_puffs": {"visibility_m": 200.0},
 }
 """What each field shapes."""
-
-
-def _close(expected: float, actual: float, relative: float) -> bool:
-    return math.isclose(expected, actual, rel_tol=relative, abs_tol=1e-300)
-
-
-@pytest.mark.parametrize(("quantity", "values"), TABLE.items(), ids=str)
-def test_each_stop_has_the_documented_value(
-    quantity: tuple[str, str], values: tuple[float, ...]
-) -> None:
-    kind, name = quantity
-    for severity, value in zip(NAMED_SEVERITIES, values, strict=True):
-        assert math.isclose(value, getattr(FACTORY[kind](severity), name), rel_tol=1e-12)
-
-
-def test_fog_stops_are_the_documented_ranges() -> None:
-    """600, 300, 150 and 50 m are the extinctions' ranges in round numbers."""
-    for severity, visibility_m in zip(NAMED_SEVERITIES, (600, 300, 150, 50), strict=True):
-        assert Weather.fog(severity).visibility_m == pytest.approx(visibility_m, rel=2e-3)
-    heights = [Weather.fog(severity).fog_scale_height_m for severity in NAMED_SEVERITIES]
-    assert heights == [math.inf, math.inf, pytest.approx(60), pytest.approx(25)]
-
-
-@pytest.mark.parametrize(("quantity", "values"), TABLE.items(), ids=str)
-def test_between_stops_quantities_are_log_linear(
-    quantity: tuple[str, str], values: tuple[float, ...]
-) -> None:
-    kind, name = quantity
-    for s in GRID[26:]:
-        expected = math.exp(np.interp(s, STOPS, np.log(values)))
-        assert math.isclose(expected, getattr(FACTORY[kind](s), name), rel_tol=1e-12)
-
-
-@pytest.mark.parametrize(("quantity", "values"), TABLE.items(), ids=str)
-def test_below_light_quantities_fall_to_zero_by_their_power(
-    quantity: tuple[str, str], values: tuple[float, ...]
-) -> None:
-    kind, name = quantity
-    power = POWER_BELOW.get(quantity, 2)
-    for s in GRID[1:26]:
-        expected = values[0] * (4 * s) ** power
-        assert math.isclose(expected, getattr(FACTORY[kind](s), name), rel_tol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("kind", "name"),
-    [
-        ("rain", "rain_mm_per_h"),
-        ("rain", "mist_per_km"),
-        ("rain", "spray_per_km"),
-        ("snow", "snow_mm_per_h"),
-        ("snow", "mist_per_km"),
-        ("snow", "snow_cover"),
-        ("fog", "fog_per_m"),
-    ],
-)
-def test_units_rise_strictly_with_severity(kind: str, name: str) -> None:
-    values = [getattr(FACTORY[kind](s), name) for s in GRID]
-    assert all(a < b for a, b in itertools.pairwise(values))
-
-
-@pytest.mark.parametrize("kind", FACTORY)
-def test_nothing_falls_with_severity(kind: str) -> None:
-    """Quantities that saturate (wetness, clouds) and the wind stay or rise; ranges shrink."""
-    states = [FACTORY[kind](s) for s in GRID]
-    for name in ("wetness", "snow_cover", "overcast", "gustiness"):
-        values = [getattr(state, name) for state in states]
-        assert all(a <= b for a, b in itertools.pairwise(values)), name
-    speeds = [math.hypot(*state.wind_m_per_s) for state in states]
-    assert all(a <= b for a, b in itertools.pairwise(speeds))
-    for name in ("visibility_m", "fog_scale_height_m"):
-        values = [getattr(state, name) for state in states]
-        assert all(a >= b for a, b in itertools.pairwise(values)), name
+UNSEEN = {"wind_m_per_s", "gustiness", "fog_scale_height_m", *THING}
+"""What cannot be seen alone."""
 
 
 @pytest.mark.parametrize("kind", FACTORY)
@@ -158,25 +65,10 @@ def test_severity_zero_is_clear(kind: str) -> None:
 def test_wind_alone_and_a_height_without_fog_are_clear() -> None:
     assert Weather(wind_m_per_s=(3, 2, 1), gustiness=1, fog_scale_height_m=50).is_clear
     assert Weather(snow_wetness=1, fog_patchiness=1, fog_puffs=0.5).is_clear
-    for name in ("rain_mm_per_h", "snow_mm_per_h", "mist_per_km", "spray_per_km"):
-        assert not Weather(**{name: 0.1}).is_clear
-    for name in ("wetness", "snow_cover", "overcast"):
-        assert not Weather(**{name: 0.1}).is_clear
+    seen = {field.name for field in fields(Weather)} - UNSEEN
+    for name in seen - {"visibility_m"}:
+        assert not Weather(**{name: 0.1}).is_clear, name
     assert not Weather(visibility_m=1000).is_clear
-
-
-@given(st.floats(1e-3, 1))
-def test_severity_comes_back_from_units(s: float) -> None:
-    assert _close(s, rain_severity(Weather.rain(s).rain_mm_per_h), 1e-9)
-    assert _close(s, snow_severity(Weather.snow(s).snow_mm_per_h), 1e-9)
-    assert _close(s, fog_severity(Weather.fog(s).visibility_m), 1e-9)
-
-
-@given(st.floats(1e-6, 75), st.floats(1e-6, 4), st.floats(50, 1e7))
-def test_units_come_back_from_severity(rain: float, snow: float, visibility_m: float) -> None:
-    assert _close(rain, Weather.rain(rain_severity(rain)).rain_mm_per_h, 1e-9)
-    assert _close(snow, Weather.snow(snow_severity(snow)).snow_mm_per_h, 1e-9)
-    assert _close(visibility_m, visibility_from_severity(fog_severity(visibility_m)), 1e-9)
 
 
 def test_beyond_extreme_the_severity_is_cut_and_the_unit_kept() -> None:
@@ -186,32 +78,21 @@ def test_beyond_extreme_the_severity_is_cut_and_the_unit_kept() -> None:
     assert Weather.fog(visibility_m=2).visibility_m == 2
 
 
-@given(st.floats(0.01, 1))
-def test_a_unit_brings_what_its_severity_brings(s: float) -> None:
-    given_in_units = Weather.rain(mm_per_h=Weather.rain(s).rain_mm_per_h)
-    for field in ("mist_per_km", "spray_per_km", "wetness", "overcast", "gustiness"):
-        assert _close(getattr(Weather.rain(s), field), getattr(given_in_units, field), 1e-8)
-
-
-def test_named_severities() -> None:
-    assert NAMED_SEVERITIES == {"light": 0.25, "moderate": 0.5, "heavy": 0.75, "extreme": 1.0}
-    for name, s in NAMED_SEVERITIES.items():
-        assert parse_severity(name) == s
-        for factory in FACTORY.values():
-            assert factory(name) == factory(s)
-
-
 def test_overrides_replace_what_comes_with_the_weather() -> None:
     state = Weather.rain("heavy", wetness=0.1, wind_m_per_s=(3, 0, 0))
     assert state == replace(Weather.rain("heavy"), wetness=0.1, wind_m_per_s=(3.0, 0.0, 0.0))
 
 
+LEFT = {"rain": ("puddles",), "snow": ("snow_cover", "road_snow_cover", "snow_depth_m")}
+"""What rain and snow leave on the ground."""
+
+
 @pytest.mark.parametrize("kind", ["rain", "snow"])
 def test_not_falling_leaves_the_ground_and_the_sky(kind: str) -> None:
     falls, fell = FACTORY[kind]("heavy"), FACTORY[kind]("heavy", falling=False)
-    in_the_air = {f"{kind}_mm_per_h": 0.0, "mist_per_km": 0.0, "spray_per_km": 0.0}
-    assert fell == replace(falls, **in_the_air)
-    assert fell.overcast > 0
+    assert fell == replace(falls, **dict.fromkeys(FALLING, 0.0))
+    left = ("overcast", "wetness", "lamps", *LEFT[kind])
+    assert all(getattr(fell, name) == getattr(falls, name) > 0 for name in left)
     assert not fell.is_clear
 
 
@@ -310,7 +191,22 @@ def test_mix_adds_rates_and_extinctions() -> None:
     assert both.visibility_m == pytest.approx(300)
     twice = Weather.mix(Weather.fog(visibility_m=300), Weather.fog(visibility_m=300))
     assert twice.visibility_m == pytest.approx(150)
-    assert Weather.mix(Weather(wetness=0.5), Weather(wetness=0.5)).wetness == 0.75
+    dripping = Weather.mix(Weather(lens_drops=30), Weather(lens_drops=5))
+    assert dripping.lens_drops == 35
+    assert Weather.mix(dripping, Weather(lens_drops=490)).lens_drops == 500
+
+
+@pytest.mark.parametrize("name", ["wetness", "puddles", "snow_cover", "road_snow_cover"])
+def test_a_mixed_share_is_what_either_leaves(name: str) -> None:
+    mixed = Weather.mix(Weather(**{name: 0.5}), Weather(**{name: 0.4}))
+    assert getattr(mixed, name) == pytest.approx(0.7)
+
+
+@pytest.mark.parametrize("name", ["overcast", "snow_depth_m", "lamps", "wipers"])
+def test_a_mixed_cause_is_shared(name: str) -> None:
+    """One sky, one blanket of snow, one reason to switch on lamps: the larger of the two."""
+    mixed = Weather.mix(Weather(**{name: 0.5}), Weather(**{name: 0.4}))
+    assert getattr(mixed, name) == 0.5
 
 
 def test_mixed_fog_has_the_height_that_its_extinctions_weigh() -> None:
@@ -377,11 +273,17 @@ OLD_RECORD = (
     "[0.0, 6.0, 0.0]}"
 )
 """Heavy rain as it was written before air had gusts."""
+OLD_FIELDS = {
+    *("rain_mm_per_h", "snow_mm_per_h", "visibility_m", "fog_scale_height_m", "mist_per_km"),
+    *("wetness", "snow_cover", "overcast", "wind_m_per_s"),
+}
 
 
 def test_an_older_record_is_read_with_nothing_new() -> None:
-    plain = Weather.rain("heavy", gustiness=0, spray_per_km=0)
-    assert Weather.from_json(OLD_RECORD) == plain
+    new = {field.name: field.default for field in fields(Weather) if field.name not in OLD_FIELDS}
+    assert set(json.loads(OLD_RECORD)) == OLD_FIELDS
+    assert Weather.from_json(OLD_RECORD) == Weather.rain("heavy", **new)
+    assert not any(new.values())
 
 
 def test_a_weather_is_a_value() -> None:
@@ -408,13 +310,19 @@ BAD_FIELDS: list[tuple[str, Any]] = [
     ("fog_scale_height_m", 0.0),
     ("mist_per_km", 101),
     ("wetness", 1.01),
+    ("puddles", 1.01),
     ("snow_cover", -0.01),
+    ("road_snow_cover", 1.01),
+    ("snow_depth_m", 2.01),
     ("overcast", 2),
     ("gustiness", 1.01),
     ("snow_wetness", -0.01),
     ("fog_patchiness", 1.01),
     ("fog_puffs", 0.51),
     ("spray_per_km", 201),
+    ("lamps", -0.01),
+    ("lens_drops", 501),
+    ("wipers", 1.01),
     ("wind_m_per_s", (0, 0)),
     ("wind_m_per_s", 3.0),
     ("wind_m_per_s", "abc"),
@@ -430,36 +338,6 @@ def test_a_field_out_of_range_is_refused_by_name(name: str, value: Any) -> None:
         Weather(**{name: value})
     with pytest.raises(ArgumentError, match=name):
         Weather.from_dict({name: math.nan if value is None else value})
-
-
-@pytest.mark.parametrize("severity", [-0.01, 1.01, math.nan, math.inf, "hurricane", True, [0.5]])
-@pytest.mark.parametrize("kind", FACTORY)
-def test_a_severity_out_of_range_is_refused(kind: str, severity: Any) -> None:
-    with pytest.raises(ArgumentError, match="severity"):
-        FACTORY[kind](severity)
-
-
-@pytest.mark.parametrize(
-    ("kind", "unit_name", "value"),
-    [
-        ("rain", "mm_per_h", math.inf),
-        ("rain", "mm_per_h", math.nan),
-        ("rain", "mm_per_h", "25"),
-        ("snow", "mm_per_h", -1),
-        ("snow", "mm_per_h", 51),
-        ("fog", "visibility_m", 0),
-        ("fog", "visibility_m", math.nan),
-    ],
-)
-def test_a_unit_out_of_range_is_refused(kind: str, unit_name: str, value: Any) -> None:
-    with pytest.raises(ArgumentError, match=unit_name):
-        FACTORY[kind](**{unit_name: value})
-
-
-def test_either_a_severity_or_a_unit() -> None:
-    for arguments in ({}, {"severity": 0.5, "mm_per_h": 3}):
-        with pytest.raises(ArgumentError, match="either a severity or mm_per_h"):
-            Weather.rain(**arguments)
 
 
 def test_an_unknown_field_is_refused_by_name() -> None:

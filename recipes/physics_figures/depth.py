@@ -12,7 +12,7 @@ from weather_aug.particles import statistics
 from weather_aug.particles.resolve import drawn_share
 from weather_aug.render.froxels import even_fog
 from weather_aug.render.medium import optical_depth
-from weather_aug.render.options import RenderOptions
+from weather_aug.render.options import EFFECTS, RenderOptions
 from weather_aug.render.stage import medium_of, optics_of
 from weather_aug.weather import Weather
 
@@ -200,7 +200,7 @@ def _rendered_snow(seeds: int) -> tuple[scenes.Float, scenes.Float]:
     for rate, depth_m in ((1.0, 30.0), (4.0, 30.0), (10.0, 30.0), (10.0, 60.0), (25.0, 60.0)):
         frame = scenes.wall(cam, depth_m)
         weather = Weather(snow_mm_per_h=rate)
-        options = RenderOptions(40_000)
+        options = RenderOptions(40_000, without=EFFECTS)
         frames = [(frame, weather, seed) for seed in range(min(seeds, 3))]
         tau.append(_snow_per_m(rate) * depth_m)
         mean.append(np.exp(-scenes.extinction_per_m(frames, options=options) * depth_m))

@@ -63,7 +63,8 @@ def _step_contrast(cam: scenes.Camera, visibility_m: float, depth_m: float) -> f
     contrasts = []
     for airlight in np.linspace(0.3, 0.8, 24):
         ambience = replace(scenes.AMBIENCE, airlight=np.full(3, airlight))
-        light = linear_from_srgb(render(frame, weather, seed=0, ambience=ambience).image / 255.0)
+        shot = render(frame, weather, seed=0, ambience=ambience, options=scenes.AIR_ONLY)
+        light = linear_from_srgb(shot.image / 255.0)
         contrasts.append(light[:, 4:].mean() - light[:, :4].mean())
     return float(np.mean(contrasts))
 

@@ -14,6 +14,7 @@ from weather_aug.particles.field import ParticleField
 from weather_aug.particles.statistics import Population
 from weather_aug.render.compose import render
 from weather_aug.render.medium import Medium
+from weather_aug.render.options import EFFECTS, RenderOptions
 from weather_aug.render.project import BAND_ROWS, project, sorted_in_blocks, split_by_band
 from weather_aug.render.stage import optics_of
 from weather_aug.render.tile import TILE_FLOATS, blend_band
@@ -33,6 +34,8 @@ AMBIENCE = Ambience(
 )
 CLEAR_AIR = Medium(*(np.float32(v) for v in (0, 0, 0, 0, 60 / 1024, 0, 3)))
 NOTHING_RESOLVED = np.zeros(1025, np.float32)
+AIR_ONLY = RenderOptions(without=EFFECTS)
+"""Air and particles: the background as recorded, clean glass, a camera that adds nothing."""
 
 
 def camera(
@@ -63,14 +66,18 @@ def slants(cam: Camera) -> Float:
     return np.asarray(np.sqrt(1 + ((u - cx) / fx) ** 2 + ((v - cy) / fy) ** 2))
 
 
-def through(frame: Frame, weather: Weather, seed: int = 0, **kwargs: Any) -> Float:
+def through(
+    frame: Frame, weather: Weather, seed: int = 0, options: RenderOptions = AIR_ONLY
+) -> Float:
     """Transmittance (H, W) of a frame rendered in a weather."""
-    return render(frame, weather, seed=seed, ambience=AMBIENCE, **kwargs).transmittance
+    return render(frame, weather, seed=seed, ambience=AMBIENCE, options=options).transmittance
 
 
-def extinction_per_m(frames: list[tuple[Frame, Weather, int]], **kwargs: Any) -> float:
+def extinction_per_m(
+    frames: list[tuple[Frame, Weather, int]], options: RenderOptions = AIR_ONLY
+) -> float:
     """Extinction that explains the mean transmittance of rendered walls: Beer-Lambert, inverted."""
-    shots = [through(frame, weather, seed, **kwargs) for frame, weather, seed in frames]
+    shots = [through(frame, weather, seed, options) for frame, weather, seed in frames]
     mean = float(np.mean(shots))
     frame = frames[0][0]
     assert frame.depth_m is not None

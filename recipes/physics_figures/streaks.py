@@ -14,7 +14,7 @@ from weather_aug.clip.types import FrameKey
 from weather_aug.edit.ambience import ambience_of
 from weather_aug.particles import statistics
 from weather_aug.render.compose import render
-from weather_aug.render.options import RenderOptions
+from weather_aug.render.options import EFFECTS, RenderOptions
 from weather_aug.weather import Weather
 
 TABLE = {
@@ -108,7 +108,8 @@ def _focus(axes: scenes.Any, quick: bool) -> dict[str, float]:
     cam = frame.camera
     weather = Weather.rain(mm_per_h=40.0, wind_m_per_s=(0.0, 0.0, 0.0))
     ambience = ambience_of(frame, np.eye(3))
-    shot = render(frame, weather, seed=2, ambience=ambience, options=RenderOptions(50_000))
+    options = RenderOptions(50_000, without=EFFECTS)
+    shot = render(frame, weather, seed=2, ambience=ambience, options=options)
     axes.imshow(shot.image)
     population = statistics.rain(40.0)
     population = replace(population, sway_per_wind_s=0 * population.sway_m)

@@ -13,7 +13,6 @@ from physics_figures.style import BLUE, GREEN, ORANGE, PURPLE, formula, measured
 from weather_aug.colour import linear_from_srgb
 from weather_aug.particles import statistics
 from weather_aug.render.compose import render
-from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
 
 DISCS_TAU = 0.05
@@ -89,7 +88,10 @@ def _rendered(scales: scenes.Float, seeds: int) -> dict[str, scenes.Float]:
         cam = full.resized(round(480 * scale), round(288 * scale))
         frame = scenes.wall(cam, 25.0, _ramp(cam))
         plain, matched = (
-            [render(frame, weather, seed=s, ambience=light) for s in range(seeds)]
+            [
+                render(frame, weather, seed=s, ambience=light, options=scenes.AIR_ONLY)
+                for s in range(seeds)
+            ]
             for light in (scenes.AMBIENCE, alike)
         )
         found[names[0]].append(np.mean([s.transmittance for s in plain]))
@@ -181,4 +183,4 @@ def _rendered_extinction(
     weather = Weather(**{name: rate}, snow_wetness=wetness)
     frame = scenes.wall(cam, 50.0)
     frames = [(frame, weather, seed) for seed in range(1 if quick else 6)]
-    return scenes.extinction_per_m(frames, options=RenderOptions(20_000))
+    return scenes.extinction_per_m(frames)

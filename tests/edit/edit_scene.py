@@ -15,7 +15,7 @@ from weather_aug.colour import SRGB_LEVELS_LINEAR
 from weather_aug.edit.ambience import Ambience
 from weather_aug.edit.physical.dress import dress
 from weather_aug.edit.physical.edit import edited, geometry_of
-from weather_aug.edit.physical.layers import NAMES, Layers, layers_of
+from weather_aug.edit.physical.layers import ILLUMINATION, NAMES, Layers, layers_of, thumbnail_of
 from weather_aug.edit.physical.materials import MATERIALS, material_table
 from weather_aug.edit.physical.site import site_of
 from weather_aug.taxonomy import ROAD, SIDEWALK, SKY, TERRAIN, TRAIN_ID
@@ -162,7 +162,10 @@ def plain_layers(street, *, step=4.0, illumination=None, **maps):
     for name, value in named.items():
         stack[NAMES.index(name)] = value
     plane = np.zeros(3)
-    return Layers(step, stack, np.zeros(3, np.float32), plane, street.frame.label)
+    lit = float(np.median(stack[ILLUMINATION]))
+    thumbnail = thumbnail_of(street.frame.image)
+    no_tint = np.zeros(3, np.float32)
+    return Layers(step, stack, no_tint, plane, street.frame.label, lit, thumbnail)
 
 
 def painted(street, layers, weather, window=None, without=()):

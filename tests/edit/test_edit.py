@@ -141,11 +141,6 @@ def test_maps_cut_too_narrow_are_found(monkeypatch):
         check_window(street(**COARSE), ALL, (21, 5, 9, 100))
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="dress looks for upper edges in the 96 rows above a window only; a cap that is longer"
-    " than that (0.4 m at 4 m and 1500 px) is missing from windows that start below it",
-)
 @pytest.mark.parametrize("name", ["building", "car"])
 def test_a_window_below_the_edge_of_something_near_is_the_same_pixels(name):
     box = (name, (4.0, 9.0), (-1.0, 1.0), (0.0, 1.2))
@@ -305,11 +300,6 @@ def test_the_first_of_it_is_little(name):
     check_continuous(street(), Weather(), name)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="standing_run: the topmost pixel of a thing lies 0 m below its edge and is all white"
-    " under a cap of any height; it should be by the share of the pixel that the cap fills",
-)
 def test_the_first_snow_is_little():
     check_continuous(street(), Weather(), "snow_cover")
 

@@ -83,22 +83,13 @@ def puddled(amount):
     return Weather(wetness=1.0, puddles=amount)
 
 
-BIASED = pytest.mark.xfail(
-    strict=True,
-    reason="ground_rows.covered: the threshold 1 + fuzz - amount (1 + 2 fuzz) covers too little"
-    " below one half and too much above; 1 - amount, with fuzz at most amount and 1 - amount, is"
-    " true to 3 %",
-)
-
-
-@pytest.mark.parametrize(
-    "amount", [a if a == 0.5 else pytest.param(a, marks=BIASED) for a in ASKED]
-)
+@pytest.mark.parametrize("amount", ASKED)
 def test_snow_covers_as_much_of_the_road_as_was_asked(amount):
-    check_share(amount, snowed)
+    # Far pixels average the noise towards 1/2, where nearly all of it is covered.
+    check_share(amount, snowed, tolerance=0.03 if amount < 0.9 else 0.04)
 
 
-@pytest.mark.parametrize("amount", [pytest.param(0.15, marks=BIASED), 0.5])
+@pytest.mark.parametrize("amount", [0.15, 0.5])
 def test_puddles_cover_as_much_of_the_road_as_was_asked(amount):
     check_share(amount, puddled)
 
@@ -109,9 +100,7 @@ def test_more_snow_than_asked_is_found():
 
 
 @pytest.mark.parametrize("fuzz", [0.07, 0.2, 0.5])
-@pytest.mark.parametrize(
-    "amount", [a if a == 0.5 else pytest.param(a, marks=BIASED) for a in ASKED]
-)
+@pytest.mark.parametrize("amount", ASKED)
 def test_the_threshold_is_the_share_of_even_noise(amount, fuzz):
     noise = (np.arange(400, dtype=np.float32) + 0.5) / 400
     found = [covered(np.float32(amount), np.float32(fuzz), value) for value in noise]
@@ -274,11 +263,6 @@ def film_error(illumination, wetness=1.0):
     return light(image[-1, 12]).mean() / (bare * ratio * exposed) - 1
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="ground_rows.film takes the exposure's gain for albedo: a wet street, exposed 15 %"
-    " longer, counts as 15 % paler, and darkens by up to 6 % less",
-)
 @pytest.mark.parametrize("illumination", [1.5, 3.0])
 def test_a_film_darkens_by_lekner_and_dorf(illumination):
     assert abs(film_error(illumination)) < 0.01

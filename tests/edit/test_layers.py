@@ -131,11 +131,6 @@ def test_a_driven_way_moves_the_tracks_alone():
     assert different == {"lateral_m"}
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="smear leaves `out` as it was where the whole picture lies above the horizon, and"
-    " `mirrored` hands it memory that nobody has written",
-)
 def test_smears_fill_all_they_are_given_where_no_ray_goes_down():
     height, width = 3, 4
     up = View(*(np.float32(v) for v in (4.0, 4.0, 1.5, 9.0, 0.0, -1.0, 0.0, 1.5)))
@@ -145,12 +140,6 @@ def test_smears_fill_all_they_are_given_where_no_ray_goes_down():
     assert np.isfinite(out).all()
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=IndexError,
-    reason="relight._lit_level samples every other row and column; ground in the rows between only"
-    " leaves it without a value",
-)
 def test_a_single_row_of_ground_is_enough_to_look_at():
     street = Street(64, 40, 60.0)
     label = np.full((40, 64), 2, np.uint8)

@@ -161,8 +161,9 @@ def smooth(low, high, value):
 
 def cover(amount, fuzz, value):
     """How far places of this noise are covered when a share `amount` of all is."""
-    threshold = 1 + fuzz - amount * (1 + 2 * fuzz)
-    return smooth(threshold - fuzz, threshold + fuzz, value)
+    soft = np.maximum(np.minimum(fuzz, np.minimum(amount, 1 - amount)), 1e-3)
+    threshold = 1 + 1e-3 - amount * (1 + 2e-3)
+    return smooth(threshold - soft, threshold + soft, value)
 
 
 def wheel_tracks(lateral_m, value):
@@ -265,7 +266,7 @@ def edited(frame, layers, weather, ambience, without=()):
             continue
         now = light
         if film * material.porosity > 0:
-            albedo = np.clip(now / np.maximum(lit, 0.02)[..., None], 0.01, 0.95)
+            albedo = np.clip(now / (gain * np.maximum(lit, 0.02))[..., None], 0.01, 0.95)
             now = now * (1 + film * material.porosity * (film_ratio(albedo) - 1))
         is_ground = TRAIN_ID[name] in GROUND
         is_road = TRAIN_ID[name] == ROAD
@@ -292,7 +293,7 @@ def edited(frame, layers, weather, ambience, without=()):
                 rut = tracks if is_road else np.zeros(shape)
                 softer = taste.TRACK_SOFTNESS if is_road else 0.0
                 share = cover(amount * (1 - (1 - taste.TRACK_COVER) * rut), fuzz + softer, value)
-                under = np.minimum(now @ WEIGHTS / (0.12 * lit), 2.0)
+                under = np.minimum(now @ WEIGHTS / (0.12 * gain * lit), 2.0)
                 least = taste.SLUSH if is_road else taste.CLEAN
                 shade = (least + (1.02 - least) * value) * (1 - taste.SHOWING_THROUGH * (1 - under))
                 now = laid(now, share, bright * shade)
@@ -307,15 +308,18 @@ def edited(frame, layers, weather, ambience, without=()):
             else:
                 uneven = 0.6 + 0.8 * on_walls
                 edge = material.cap_m * snow * uneven + 0.4 * deep_m
-                share = 1 - smooth(0.7 * edge, 1.2 * edge, edges)
+                share = np.clip((edge - edges) / np.maximum(oblique, 1e-5), 0, 1)
                 if material.level > 0 and labelled:
                     level = smooth(0.55, 0.85, at("facing_up"))
                     oblique_fuzz = 0.07 + 0.25 * oblique
                     share = np.maximum(share, cover(amount * level, oblique_fuzz, on_walls))
-            buried = view.height < deep_m * (0.6 + 0.8 * on_walls)
-            share = np.where(
-                buried & (view.depth < 30.0), np.maximum(share, snow * material.buried), share
+            buried = deep_m * (0.6 + 0.8 * on_walls)
+            lies_on = (
+                snow
+                * material.buried
+                * (1 - smooth(0.7 * buried, 1.1 * buried + 1e-6, view.height))
             )
+            share = np.where(view.depth < 30.0, np.maximum(share, lies_on), share)
             now = laid(now, share, lies)
         done = np.where(here[..., None], now, done)
     if has("sky") and weather.overcast > 0:

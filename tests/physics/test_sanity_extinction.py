@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from air_only import AIR_ONLY, air_only
 from oracles import faults, size_laws
 from oracles import reference_render as reference
 from particles.particle_scene import camera, field
@@ -17,7 +18,6 @@ from weather_aug.render import fields, stage
 from weather_aug.render.compose import render
 from weather_aug.render.froxels import even_fog
 from weather_aug.render.medium import Medium, optical_depth
-from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -166,7 +166,7 @@ def check_rendered_walls(ambience, depth_m, budgets, seeds):
                 Weather(snow_mm_per_h=4.0),
                 seed=seed,
                 ambience=ambience,
-                options=RenderOptions(budget),
+                options=air_only(budget),
             )
             for seed in range(seeds)
         ]
@@ -204,7 +204,10 @@ def check_resolution(ambience, weather, seeds, tolerance=0.01):
         # Sixty levels, equally many of each at any resolution: roundings to 8 bits average out.
         v, u = np.mgrid[: cam.height, : cam.width]
         frame = make_frame(cam, (94 + (u + 7 * v) % 60)[..., None], 25.0)
-        shots = [render(frame, weather, seed=s, ambience=ambience) for s in range(seeds)]
+        shots = [
+            render(frame, weather, seed=s, ambience=ambience, options=AIR_ONLY)
+            for s in range(seeds)
+        ]
         means.append(
             [
                 np.mean([shot.transmittance.mean() for shot in shots]),

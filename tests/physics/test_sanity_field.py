@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from air_only import air_only
 from oracles import faults
 from particles.particle_scene import camera, field, inside, nearest, whole, world
 from physics_scene import measured, splats_of_records
@@ -16,7 +17,6 @@ from weather_aug.particles.resolve import NEAR_M
 from weather_aug.render import batch_project
 from weather_aug.render.batch_medium import AirColumn
 from weather_aug.render.compose import render
-from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
 
 CELLS, SIDE_M = 5, 3.2
@@ -77,7 +77,7 @@ def layer_luminance(ambience, places_m, times_s):
         cam = camera(centre=(x, 0, 1.5), speed=15.0, width=128, height=80, exposure_s=0.002)
         frame = make_frame(cam, 0, 8.0, time_s=time_s)
         through = [
-            render(frame, weather, seed=1, ambience=ambience, options=RenderOptions(budget))
+            render(frame, weather, seed=1, ambience=ambience, options=air_only(budget))
             for budget in (2_000, 0)
         ]
         mean.append(through[0].transmittance.mean() - through[1].transmittance.mean())

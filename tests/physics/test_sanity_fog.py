@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from air_only import AIR_ONLY
 from oracles import faults
 from oracles import reference_render as reference
 from physics_scene import measured
@@ -21,7 +22,8 @@ NOTHING_RESOLVED = np.zeros(1025, np.float32)
 
 def rendered(frame, weather, ambience):
     """Linear light (H, W, 3) of the picture."""
-    return reference.linear(render(frame, weather, seed=0, ambience=ambience).image)
+    shot = render(frame, weather, seed=0, ambience=ambience, options=AIR_ONLY)
+    return reference.linear(shot.image)
 
 
 def check_contrast(ambience, draw=rendered):
@@ -46,7 +48,8 @@ def check_contrast(ambience, draw=rendered):
 
 def unrounded(frame, weather, ambience):
     """Linear light by the renderer's own transmittance, without rounding to levels."""
-    through = render(frame, weather, seed=0, ambience=ambience).transmittance[..., None]
+    shot = render(frame, weather, seed=0, ambience=ambience, options=AIR_ONLY)
+    through = shot.transmittance[..., None]
     return through * reference.linear(frame.image) + (1 - through) * ambience.airlight
 
 
@@ -158,7 +161,7 @@ def check_sky(ambience, transmittance):
 
 def sky_transmittance(camera, weather, ambience):
     frame = make_frame(camera, 200, np.inf)
-    return render(frame, weather, seed=0, ambience=ambience).transmittance
+    return render(frame, weather, seed=0, ambience=ambience, options=AIR_ONLY).transmittance
 
 
 def test_13_sky(ambience):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from air_only import air_only
 from oracles import faults
 from particles.particle_scene import AXES, camera, inside, whole
 from physics_scene import measured
@@ -15,7 +16,6 @@ from weather_aug.particles import statistics
 from weather_aug.particles.field import ParticleField
 from weather_aug.render.compose import render
 from weather_aug.render.fields import RigMotion
-from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
 
 GUSTY = Weather(rain_mm_per_h=20.0, snow_mm_per_h=2.0, wind_m_per_s=(1.0, 3.0, 0.0), gustiness=0.3)
@@ -137,7 +137,7 @@ def check_parked_modes_agree(motion_of, ambience):
             GUSTY,
             seed=1,
             ambience=ambience,
-            options=RenderOptions(alignment=alignment),
+            options=air_only(alignment=alignment),
             rig=RigMotion(pose, pose),
         )
         for alignment in ("world", "camera")

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from air_only import air_only
 from oracles import faults
 from oracles import reference_render as reference
 from particles.particle_scene import whole
@@ -12,7 +13,7 @@ from weather_aug.air import Air, air_of
 from weather_aug.render.compose import render
 from weather_aug.render.fields import fields_of
 from weather_aug.render.light import rain_colour, snow_colour
-from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
+from weather_aug.render.options import DEFAULT_OPTIONS
 from weather_aug.weather import Weather
 
 GRID = np.linspace(0, 1, 101)
@@ -35,7 +36,7 @@ def extinction_per_m(weather):
 def mean_transmittance(weather, seed, ambience, budget):
     """Of a wall at 50 m."""
     frame = make_frame(make_camera(160, 96, 300.0, exposure_s=0.001), 60, 50.0)
-    options = RenderOptions(budget)
+    options = air_only(budget)
     shot = render(frame, weather, seed=seed, ambience=ambience, options=options)
     return float(shot.transmittance.mean())
 
@@ -104,7 +105,7 @@ def layer_of(kind, severity, seed, ambience):
             seed=seed,
             ambience=ambience,
             air=Air.held(weather),
-            options=RenderOptions(budget),
+            options=air_only(budget),
         )
         for budget in (0, 20_000)
     ]

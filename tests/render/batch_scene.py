@@ -8,9 +8,18 @@ from render_scene import make_camera, make_frame
 
 from weather_aug.clip.types import Frame
 from weather_aug.edit.ambience import Ambience
-from weather_aug.render.batch import render_batch
+from weather_aug.render.batch import BATCH_OPTIONS, render_batch
 from weather_aug.render.compose import render
-from weather_aug.taxonomy import BUILDING, ROAD, SKY
+from weather_aug.taxonomy import (
+    BUILDING,
+    IGNORE,
+    ROAD,
+    SIDEWALK,
+    SKY,
+    TERRAIN,
+    TRAIN_ID,
+    VEGETATION,
+)
 from weather_aug.weather import Weather
 
 AMBIENCE = Ambience(
@@ -37,6 +46,18 @@ WEATHERS = {
     "rain and fog": Weather.mix(replace(FOG, fog_patchiness=0.5), Weather.rain("extreme")),
     "rain and snow": Weather.mix(Weather.rain("heavy"), Weather.snow("heavy")),
 }
+BACKGROUNDS = {
+    "overcast": Weather(overcast=0.7),
+    "wet": Weather(wetness=1.0, puddles=0.4),
+    "after rain": Weather.rain("extreme", falling=False),
+    "snowed on": Weather(snow_cover=0.6, road_snow_cover=0.4, snow_depth_m=0.08),
+    "after snow": Weather.snow("moderate", falling=False),
+    "road snow": Weather(road_snow_cover=0.5, overcast=1.0),
+    "rain after snow": Weather.mix(
+        Weather.rain("moderate"), Weather.snow("heavy", falling=False, wetness=0.5)
+    ),
+}
+"""Weathers of surfaces, most of them under clear air."""
 AGREEMENT_DB = 50
 """At least this near to `render`; its own rounding to 8 bits alone is 59 dB."""
 MOTIONS = {
@@ -58,7 +79,8 @@ class Case:
     seed: int = 3
 
     def alone(self, **choices):
-        """By `render`."""
+        """By `render`, with what a batch draws."""
+        choices = {"options": BATCH_OPTIONS} | choices
         return render(self.frame, self.weather, seed=self.seed, ambience=AMBIENCE, **choices)
 
 
@@ -79,6 +101,31 @@ def street(motion="parked", *, width=160, height=96, labelled=True, time_s=1.0, 
     image = np.random.default_rng(5).integers(20, 235, (height, width, 3)).astype(np.uint8)
     image[label == SKY] = 200 + image[label == SKY] // 8
     return make_frame(camera, image, depth, label if labelled else None, time_s)
+
+
+def yard(*, labelled=True, **optics):
+    """The street with all that surfaces may be: pavements, grass, trees, a car, poles, a shadow."""
+    frame = street("driving", labelled=labelled, **optics)
+    depth, image = frame.depth_m.copy(), frame.image.copy()
+    height, width = depth.shape
+    v, u = np.mgrid[:height, :width].astype(np.float32)
+    left_m = (u - (width - 1) / 2) / frame.camera.focal_px[0] * np.minimum(depth, 300)
+    y = (v - (height - 1) / 2) / frame.camera.focal_px[1]
+    ground = np.isfinite(depth) & (depth * y > 1.5 - 1e-3)
+    label = np.where(ground, ROAD, np.where(np.isinf(depth), SKY, BUILDING)).astype(np.uint8)
+    label[ground & (np.abs(left_m) > 2.5)] = SIDEWALK
+    label[ground & (left_m > 3.2)] = TERRAIN
+    label[(label == BUILDING) & (u < width // 4)] = VEGETATION
+    label[height - 6 :, width // 3 : width // 2] = IGNORE
+    image[:] = 90 + image // 8
+    image[label == VEGETATION] = (30, 70, 25) + image[label == VEGETATION] // 4
+    image[label == SKY] = (150, 180, 240)
+    image[ground & (depth > 5) & (depth < 9)] //= 2
+    car = np.s_[height // 2 - 2 : height // 2 + 12, width // 2 : width // 2 + 26]
+    label[car], depth[car], image[car] = TRAIN_ID["car"], 8.5, (120, 20, 25)
+    pole = np.s_[height // 4 : height // 2 + 14, width // 5 : width // 5 + 3]
+    label[pole], depth[pole] = TRAIN_ID["pole"], 7.0
+    return make_frame(frame.camera, image, depth, label if labelled else None)
 
 
 def arguments(cases, dtype=torch.float32):

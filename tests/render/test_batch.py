@@ -1,7 +1,7 @@
 """render_batch(): the same pictures as render(), in torch, with gradients."""
 
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 
 import numpy as np
@@ -24,24 +24,32 @@ from weather_aug.errors import ArgumentError, MissingExtraError
 from weather_aug.particles.shelter import Shelter
 from weather_aug.render import batch as batch_module
 from weather_aug.render import batch_medium, batch_particles, batch_project, batch_shade
-from weather_aug.render.batch import render_batch
-from weather_aug.render.batch_checks import NOT_DRAWN
+from weather_aug.render.background import looked_at
+from weather_aug.render.batch import BATCH_OPTIONS, render_batch
+from weather_aug.render.batch_checks import NOT_DRAWN, UNDRAWN
 from weather_aug.render.fields import RigMotion
-from weather_aug.render.options import RenderOptions
+from weather_aug.render.options import EFFECTS, RenderOptions
 from weather_aug.weather import Weather
 
 WAYS = ("torch", "compiled")
+SHARP = replace(BATCH_OPTIONS, without=(*UNDRAWN, "exposure"))
+"""With the camera's own exposure: longer ones blur particles, and what may be wrong with them."""
 
 
 @pytest.mark.parametrize("splatting", WAYS)
 @pytest.mark.parametrize(
-    ("motion", "labelled"), [*((m, True) for m in MOTIONS), ("driving", False)]
+    ("motion", "labelled", "options"),
+    [
+        *((motion, True, SHARP) for motion in MOTIONS),
+        ("driving", False, SHARP),
+        ("driving", True, BATCH_OPTIONS),
+    ],
 )
-def test_agrees_with_the_compiled_renderer(motion, labelled, splatting):
+def test_agrees_with_the_compiled_renderer(motion, labelled, options, splatting):
     cases = [Case(street(motion, labelled=labelled), weather) for weather in WEATHERS.values()]
-    shots = batch(cases, splatting=splatting)
+    shots = batch(cases, splatting=splatting, options=options)
     for k, (name, case) in enumerate(zip(WEATHERS, cases, strict=True)):
-        expected = case.alone()
+        expected = case.alone(options=options)
         assert psnr(shots.image[k], expected.image) >= AGREEMENT_DB, name
         through = shots.transmittance[k].numpy()
         assert np.abs(through - expected.transmittance).max() < 0.01, name
@@ -57,7 +65,7 @@ def test_agrees_with_the_compiled_renderer(motion, labelled, splatting):
 def test_large_flakes_hide_the_same_surfaces(splatting):
     """A long lens and a short exposure: flakes of many pixels, sharp and opaque."""
     frame = street(exposure_s=0.0003, aperture_m=0.0, focal_px=500.0)
-    case = Case(frame, Weather(snow_mm_per_h=4.0), seed=9)
+    case = Case(frame, Weather(snow_mm_per_h=10.0), seed=9)
     expected, found = case.alone(), batch([case], splatting=splatting)
     assert (expected.label != frame.label).sum() > 100
     assert (found.label[0].numpy() != expected.label).mean() <= 1e-3
@@ -70,9 +78,9 @@ def without_compensation(monkeypatch):
 
 
 def in_gamma_space(monkeypatch):
-    right = batch_shade.toned_light
+    right = batch_module._background
     encode = batch_shade.encoded
-    monkeypatch.setattr(batch_shade, "toned_light", lambda *a: encode(right(*a)))
+    monkeypatch.setattr(batch_module, "_background", lambda *a: encode(right(*a)))
     monkeypatch.setattr(batch_shade, "encoded", lambda light: light.clamp(0, 1))
 
 
@@ -108,7 +116,7 @@ FAULTS = [
 def test_the_agreement_would_notice(fault, name, monkeypatch):
     case = Case(street("driving"), WEATHERS[name])
     fault(monkeypatch)
-    assert psnr(batch([case]).image[0], case.alone().image) < 45
+    assert psnr(batch([case], options=SHARP).image[0], case.alone(options=SHARP).image) < 45
 
 
 @pytest.mark.parametrize("splatting", WAYS)
@@ -237,9 +245,9 @@ def test_options_of_the_particles_are_passed_on():
     rig = RigMotion(first, here)
     plain = case.alone()
     for choices in (
-        {"options": RenderOptions(alignment="camera"), "rig": rig},
-        {"options": RenderOptions(rain_fall_speed="atlas")},
-        {"options": RenderOptions(max_particles=300)},
+        {"options": replace(BATCH_OPTIONS, alignment="camera"), "rig": rig},
+        {"options": replace(BATCH_OPTIONS, rain_fall_speed="atlas")},
+        {"options": replace(BATCH_OPTIONS, max_particles=300)},
     ):
         expected = case.alone(**choices)
         rigs = [choices["rig"]] if "rig" in choices else None
@@ -264,6 +272,7 @@ def test_refusals():
         "airs": ([0, None], [Air((0, 0, 0), (0, 0, 0))]),
         "shelters": (["roof", None], [None]),
         "rigs": ([np.eye(4), None], [None], 3),
+        "layers": ([None], ["seen", None], [looked_at(street(), AMBIENCE), None]),
         "options": (None,),
         "splatting": ("cuda", "gsplat"),
     }
@@ -284,10 +293,36 @@ def test_what_is_not_drawn_is_refused():
             render_batch(**(inputs | {"options": RenderOptions(**{name: value})}))
 
 
+@pytest.mark.parametrize("effect", UNDRAWN)
+def test_an_effect_that_is_not_drawn_must_be_left_out_by_name(effect):
+    inputs = arguments([Case(street(width=20, height=12), WEATHERS["fog"])])
+    others = tuple(name for name in UNDRAWN if name != effect)
+    with pytest.raises(ArgumentError, match=rf"options\.without .*add {effect}, start"):
+        render_batch(**inputs, options=RenderOptions(without=others))
+
+
 def test_every_option_is_drawn_or_refused():
     """A new option of `render` has to be thought of here; `ablation` needs a preset."""
-    drawn = {"max_particles", "alignment", "rain_fall_speed"}
+    drawn = {"max_particles", "alignment", "rain_fall_speed", "without", "labels"}
     assert {f.name for f in fields(RenderOptions)} == drawn | {*NOT_DRAWN, "ablation"}
+
+
+def test_every_effect_is_drawn_or_left_out():
+    """A new effect of `render` has to be thought of here."""
+    drawn = {"relight", "sky", "film", "mirror", "puddles"} | {
+        *("ripples", "snow_cover", "tracks", "exposure")
+    }
+    assert drawn.isdisjoint(UNDRAWN)
+    assert drawn | set(UNDRAWN) == set(EFFECTS)
+    assert BATCH_OPTIONS == RenderOptions(without=UNDRAWN)
+
+
+def test_the_shutter_is_open_longer_in_the_dark():
+    case = Case(street("driving", exposure_s=0.005), Weather(snow_mm_per_h=10.0, overcast=1.0))
+    own, kept = case.alone(), case.alone(options=SHARP)
+    assert psnr(batch([case]).image[0], own.image) >= AGREEMENT_DB
+    assert psnr(batch([case], options=SHARP).image[0], kept.image) >= AGREEMENT_DB
+    assert psnr(batch([case]).image[0], kept.image) < AGREEMENT_DB - 3
 
 
 def test_gsplat_is_named_when_it_is_missing(monkeypatch):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from air_only import AIR_ONLY, air_only
 from render_scene import make_camera, make_frame
 
 from weather_aug.air import Air
@@ -13,7 +14,6 @@ from weather_aug.particles import statistics
 from weather_aug.particles.field import ParticleField
 from weather_aug.particles.resolve import NEAR_M
 from weather_aug.render.compose import render
-from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
 
 SNOW = Weather(snow_mm_per_h=4.0)
@@ -42,7 +42,7 @@ def test_drawn_and_veil_are_the_whole(name, ambience):
     frame = make_frame(moving(name), 60, 20.0)
     logs = [
         np.log(render(frame, SNOW, seed=1, ambience=ambience, options=options).transmittance.mean())
-        for options in (RenderOptions(), RenderOptions(max_particles=0))
+        for options in (AIR_ONLY, air_only(0))
     ]
     assert logs[0] == pytest.approx(logs[1], rel=0.03)
 
@@ -92,10 +92,8 @@ def test_reach_changes_without_leaps_as_the_camera_speeds_up():
 def test_the_published_look_hides_what_is_as_grey_as_it(level, unseen, ambience):
     camera = make_camera(160, 96)
     frame = make_frame(camera, level, 30.0, np.zeros((96, 160), np.uint8))
-    options = RenderOptions(preset="weatheredit")
-    shot = render(
-        frame, Weather.fog("heavy", overcast=0.0), seed=1, ambience=ambience, options=options
-    )
+    options = air_only(preset="weatheredit")
+    shot = render(frame, Weather.fog("heavy"), seed=1, ambience=ambience, options=options)
     hazy = shot.transmittance < 0.3
     assert hazy.mean() > 0.5
     middle = hazy & (shot.transmittance > 0.1)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from air_only import AIR_ONLY
 from oracles.reference_render import linear, optical_depth, rays, srgb
 from render_scene import make_camera, make_frame
 from scipy.integrate import quad
@@ -38,7 +39,8 @@ def test_height_fog_is_the_integral_along_the_ray(scale_height_m, ambience):
     camera = make_camera(width=60, height=40)
     weather = Weather(visibility_m=120.0, fog_scale_height_m=scale_height_m)
     depth_m = 30.0
-    shot = render(make_frame(camera, 60, depth_m), weather, seed=0, ambience=ambience)
+    frame = make_frame(camera, 60, depth_m)
+    shot = render(frame, weather, seed=0, ambience=ambience, options=AIR_ONLY)
     for v, u in ((0, 0), (19, 30), (39, 59), (10, 45)):
         x, y = rays(camera)[v, u]
         path, rise = depth_m * np.hypot(1, np.hypot(x, y)), -y * depth_m
@@ -55,7 +57,8 @@ def test_sky_above_height_fog_shines_through(scale_height_m, ambience):
     """A thin layer has a top: the optical depth of the sky is beta H over the sine of elevation."""
     camera = make_camera(width=60, height=40)
     weather = Weather(visibility_m=150.0, fog_scale_height_m=scale_height_m)
-    shot = render(make_frame(camera, 200, np.inf), weather, seed=0, ambience=ambience)
+    frame = make_frame(camera, 200, np.inf)
+    shot = render(frame, weather, seed=0, ambience=ambience, options=AIR_ONLY)
     x, y = rays(camera)[0, 30]
     sine = -y / np.sqrt(1 + x * x + y * y)
     path = min(1000 / sine, 20000)
@@ -70,7 +73,8 @@ def test_air_matches_the_reference(ambience):
     depth = rng.uniform(1, 150, (96, 160)).astype(np.float32)
     depth[:30] = np.inf
     weather = Weather.mix(Weather.fog("heavy"), Weather(mist_per_km=3.0))
-    shot = render(make_frame(camera, 90, depth), weather, seed=0, ambience=ambience)
+    frame = make_frame(camera, 90, depth)
+    shot = render(frame, weather, seed=0, ambience=ambience, options=AIR_ONLY)
     expected = np.exp(
         -optical_depth(
             depth.astype(float),
@@ -91,7 +95,8 @@ def test_fog_is_blended_in_linear_light(ambience):
     camera = make_camera(width=21, height=21, focal_px=500.0)
     depth_m = 100.0
     weather = Weather(visibility_m=-np.log(0.05) * depth_m / np.log(2))
-    shot = render(make_frame(camera, 30, depth_m), weather, seed=0, ambience=ambience)
+    frame = make_frame(camera, 30, depth_m)
+    shot = render(frame, weather, seed=0, ambience=ambience, options=AIR_ONLY)
     expected = srgb(0.5 * linear(30) + 0.5 * ambience.airlight)
     assert np.abs(shot.image[10, 10] - expected).max() <= 1
     in_gamma = 0.5 * 30 + 0.5 * srgb(ambience.airlight)
@@ -101,7 +106,8 @@ def test_fog_is_blended_in_linear_light(ambience):
 def test_fog_hides_far_before_near(ambience):
     camera = make_camera()
     depth = np.linspace(100, 3, 96, dtype=np.float32)[:, None]
-    shot = render(make_frame(camera, 40, depth), Weather.fog("heavy"), seed=0, ambience=ambience)
+    frame = make_frame(camera, 40, depth)
+    shot = render(frame, Weather.fog("heavy"), seed=0, ambience=ambience, options=AIR_ONLY)
     assert shot.transmittance[-1].min() > 0.9
     assert shot.transmittance[0].max() < 0.25
     to_airlight = np.abs(shot.image[0].astype(float) - srgb(ambience.airlight)).max()

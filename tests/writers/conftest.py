@@ -5,9 +5,16 @@ from __future__ import annotations
 import pytest
 from tiny_export import POLICY, TinyClip, tree_of
 
+from weather_aug.render.compose import warm_up
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.writers.export import export
 from weather_aug.writers.plan import ExportPlan, plan_export
+
+
+@pytest.fixture(scope="session", autouse=True)
+def warm() -> None:
+    """Kernels are on disk before a test waits for a process that needs them."""
+    warm_up()
 
 
 @pytest.fixture(scope="session")

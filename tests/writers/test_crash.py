@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 from tiny_export import POLICY, tree_of
 
+import weather_aug
 from weather_aug import _files
 from weather_aug.errors import OutputError
 from weather_aug.scene.scene import WeatherScene
@@ -204,10 +205,11 @@ def started(
     script.write_text(SCRIPT)
     policy = json.dumps(plan.policy.to_dict())
     arguments = [plan.scenes[0].path, out, policy, plan.count, workers, fault]
+    folders = (Path(__file__).parent, Path(weather_aug.__file__).parents[1])
     return subprocess.Popen(
         [sys.executable, str(script), *map(str, arguments)],
         start_new_session=True,
-        env=os.environ | {"PYTHONPATH": str(Path(__file__).parent)},
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, folders))},
         stderr=subprocess.PIPE,
     )
 

@@ -1,11 +1,14 @@
 """A batch of frames in weather, in torch, on the tensors' own device.
 
-The same pictures as `render`'s. What has the same bits: depth; the particles' records; on a CPU the
+The same pictures as `render`'s with the same options, which must leave out what is drawn after the
+particles and beside them (`UNDRAWN`: lamps, what vehicles raise, wet glass and the sensor). What
+has the same bits: depth; what the editor knows of a picture; the particles' records; on a CPU the
 shares of uneven fog; with splatting "compiled" also the particles' shapes and their order. What has
-not: tone, air and encoding are computed with the exact exp and powers here, by polynomials there;
-with "torch" and "gsplat" footprints are, too, and particles are sorted by their exact depth rather
-than by 4096 keys. A picture differs by less than a level nearly everywhere (above 45 dB, and 50 dB
-as a rule), and its transmittance by less than 0.01. A picture here is not quantised.
+not: background, air and encoding are computed with the exact exp and powers here, by polynomials
+there; with "torch" and "gsplat" footprints are, too, and particles are sorted by their exact depth
+rather than by 4096 keys. Neither the background nor the picture is quantised here. A picture
+differs by less than a level nearly everywhere (above 45 dB, and 50 dB as a rule), and its
+transmittance by less than 0.01.
 
 Every run gives the same bits on a device, with "compiled" and with "torch"; gsplat promises none.
 """
@@ -22,24 +25,33 @@ from torch import Tensor
 from weather_aug._checks import finite
 from weather_aug._keys import check_seed
 from weather_aug.air import Air, air_of
-from weather_aug.clip.types import FAR_DEPTH_M, Camera
+from weather_aug.clip.types import FAR_DEPTH_M, Camera, Frame
+from weather_aug.colour import SRGB_LEVELS_LINEAR
 from weather_aug.edit.ambience import Ambience
+from weather_aug.edit.physical.layers import Layers
+from weather_aug.edit.physical.look import changes_background
 from weather_aug.particles.shelter import Shelter
 from weather_aug.render import batch_shade
+from weather_aug.render.background import looked_at
 from weather_aug.render.batch_checks import (
+    BATCH_OPTIONS,
     check_cameras,
+    check_layers,
     check_options,
     check_tensors,
     one_each,
 )
+from weather_aug.render.batch_dress import Dressing
 from weather_aug.render.batch_fog import fog_shares
+from weather_aug.render.batch_label import frame_of, honest
 from weather_aug.render.batch_medium import AirColumn, pixel_rays
 from weather_aug.render.batch_particles import Job, Particles, particle_layer, splatting_on
 from weather_aug.render.batch_splat import Layer
 from weather_aug.render.fields import RigMotion
 from weather_aug.render.fog import fog_volume_of
 from weather_aug.render.label import least_linear_contrast
-from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
+from weather_aug.render.options import RenderOptions
+from weather_aug.render.taken import camera_in
 from weather_aug.taxonomy import SKY
 from weather_aug.weather import Weather
 
@@ -54,9 +66,10 @@ class RenderedBatch:
     image: Tensor
     """(B, 3, H, W) sRGB in [0, 1], of the images' dtype; not quantised."""
     label: Tensor | None
-    """(B, H, W) train ids, 255 where the surface cannot be seen; None where none were given."""
+    """(B, H, W) train ids, by `RenderOptions.labels` 255 where the surface cannot be seen; None
+    where none were given."""
     invalid: Tensor
-    """(B, H, W) uint8, 1 where the surface is undetectable or beyond the optical range."""
+    """(B, H, W) uint8, 1 where a surface cannot be told; see `RenderedFrame.invalid`."""
     transmittance: Tensor
     """(B, H, W) share of the surface's light that reaches the pixel, in [0, 1]."""
     depth: Tensor
@@ -75,18 +88,22 @@ def render_batch(
     airs: Sequence[Air | None] | None = None,
     shelters: Sequence[Shelter | None] | None = None,
     rigs: Sequence[RigMotion | None] | None = None,
+    layers: Sequence[Layers | None] | None = None,
     labels: Tensor | None = None,
-    options: RenderOptions = DEFAULT_OPTIONS,
+    options: RenderOptions = BATCH_OPTIONS,
     splatting: str = "auto",
 ) -> RenderedBatch:
     """Render each picture of a batch in its own weather, on the images' device.
 
-    The particles and the uneven fog are those of `render`, made on the CPU and uploaded; everything
-    per pixel is torch. See the module's text for what is equal to `render` bit by bit.
+    What the editor knows of a picture, the particles and the uneven fog are those of `render`, made
+    on the CPU and uploaded; all light is torch. Labels are judged on the CPU. See the module's text
+    for what is equal to `render` bit by bit.
 
     Convention:
-        Gradients flow from `image` to `images`, and nowhere else; the tone curve is interpolated
-        between 8-bit levels, and at a level its slope is that of the interval above. float16 and
+        Gradients flow from `image` to `images`, also through the edited background, and nowhere
+        else: what the editor finds out by looking (`layers`) is constant. The tone curve is
+        interpolated between 8-bit levels, and at a level its slope is that of the interval above.
+        Where a background is brighter than white its slope is 0. float16 and
         bfloat16 are computed in float32; transmittance and depth then come back in float32.
         Pictures are worked on one after the other, so that memory beyond the result does not grow
         with the batch (but for what autograd keeps).
@@ -104,8 +121,12 @@ def render_batch(
             time 0.
         shelters: B maps of bridges and roofs; None for an open sky.
         rigs: B motions of the reference camera, for options that carry the particles along with it.
-        labels: (B, H, W) integer train ids on the same device; they decide where the sky is.
-        options: Choices besides the weather, but for multiple scattering and presets.
+        layers: What the editor knows of each picture, as in `render`; where None it looks at the
+            picture now, on the CPU and rounded to 8-bit levels, which takes longer than all else.
+        labels: (B, H, W) integer train ids on the same device; they decide where the sky is, and
+            what holds water and snow.
+        options: Choices besides the weather, but for multiple scattering and presets; `without`
+            must hold `UNDRAWN`. Pass the same ones to `render` for the same picture.
         splatting: How particles are drawn: "compiled" by the kernels of `render` (CPU only),
             "torch", "gsplat" (CUDA only), or "auto": compiled on a CPU, on CUDA gsplat where it is
             installed and else torch.
@@ -130,17 +151,21 @@ def render_batch(
         one_each("airs", airs, Air, count, optional=True),
         one_each("rigs", rigs, RigMotion, count, optional=True),
         one_each("shelters", shelters, Shelter, count, optional=True),
+        check_layers(one_each("layers", layers, Layers, count, optional=True), images),
         strict=True,
     )
     dtype = images.dtype if images.dtype in (torch.float32, torch.float64) else torch.float32
     depth = _clean_depth(depth_m.detach().reshape(-1, *images.shape[2:]).to(dtype), labels)
     shots = []
-    for k, (camera, weather, seed, ambience, time_s, air, rig, shelter) in enumerate(per_picture):
+    for k, (camera, weather, seed, ambience, time_s, air, rig, shelter, known) in enumerate(
+        per_picture
+    ):
         air = air or air_of(weather, time_s, seed)
+        camera = camera_in(camera, weather, options)
         job = Job(camera, weather, seed, ambience, time_s, air, rig, shelter, options, splatting)
         label = None if labels is None else labels[k]
         image = images[k].to(dtype).contiguous()
-        shots.append(_rendered(image, depth[k], label, job))
+        shots.append(_rendered(image, depth[k], label, known, job))
     found = [shot.label for shot in shots if shot.label is not None]
     return RenderedBatch(
         image=torch.stack([shot.image for shot in shots]).to(images.dtype),
@@ -160,7 +185,9 @@ class _Shot(NamedTuple):
     transmittance: Tensor
 
 
-def _rendered(image: Tensor, depth: Tensor, label: Tensor | None, job: Job) -> _Shot:
+def _rendered(
+    image: Tensor, depth: Tensor, label: Tensor | None, layers: Layers | None, job: Job
+) -> _Shot:
     if job.weather.is_clear:
         invalid = torch.zeros(depth.shape, dtype=torch.uint8, device=depth.device)
         kept = None if label is None else label.clone()
@@ -168,39 +195,52 @@ def _rendered(image: Tensor, depth: Tensor, label: Tensor | None, job: Job) -> _
     particles = Particles.of(job)
     air = AirColumn.of(particles.medium, particles.optics, particles.carried, image)
     rays = pixel_rays(job.camera, image)
-    sky = batch_shade.neighbourhood(torch.isinf(depth)) if label is None else label == SKY
+    frame = frame_of(image, depth, label, job.camera, job.time_s)
+    dressing = _dressing(frame, depth, layers, job)
     clear = _clear_share(depth, rays, air, job)
     layer = particle_layer(particles, air, depth.float())
     at_once = ROWS_AT_ONCE if image.device.type == "cpu" else len(depth)
     bands = []
     for top in range(0, len(depth), at_once):
-        rows = slice(top, top + at_once)
-        tangents = (rays[0], rays[1][rows])
-        behind = (image[:, rows], sky[rows], tangents, clear[rows])
-        bands.append(_shaded(*behind, layer.rows(rows), air, job))
+        rows = slice(top, min(top + at_once, len(depth)))
+        light = _background(image[:, rows], depth[rows], (rays[0], rays[1][rows]), rows, dressing)
+        bands.append(_shaded(light, clear[rows], layer.rows(rows), job))
     shaded, gap = (torch.cat(parts, dim=-2) for parts in zip(*bands, strict=True))
     through = clear * layer.through.to(clear.dtype)
     distinct = gap * through >= least_linear_contrast(job.ambience.airlight)
-    honest, invalid = batch_shade.readable(
-        label, torch.isinf(depth), through, distinct, layer.covered
-    )
-    return _Shot(shaded, honest, invalid, through)
+    read, invalid = honest(label, frame, through, distinct, layer.covered, job.weather, job.options)
+    return _Shot(shaded, read, invalid, through)
 
 
-def _shaded(
+def _dressing(frame: Frame, depth: Tensor, layers: Layers | None, job: Job) -> Dressing | None:
+    """How the weather changes the background, or None where it leaves it as it is."""
+    if not changes_background(job.weather, job.options.without):
+        return None
+    camera, weather, ambience = job.camera, job.weather, job.ambience
+    if layers is None:
+        layers = looked_at(frame, ambience)
+    numbers = (depth, camera, weather, ambience, job.time_s, job.options.without)
+    return Dressing.of(layers, *numbers, labelled=frame.label is not None)
+
+
+def _background(
     image: Tensor,
-    sky: Tensor,
+    depth: Tensor,
     rays: tuple[Tensor, Tensor],
-    clear: Tensor,
-    layer: Layer,
-    air: AirColumn,
-    job: Job,
-) -> tuple[Tensor, Tensor]:
+    rows: slice,
+    dressing: Dressing | None,
+) -> Tensor:
+    """Linear light (3, R, W) of rows of the picture before there is weather in the air."""
+    if dressing is None:
+        return batch_shade.decoded(image, image.new_tensor(SRGB_LEVELS_LINEAR))
+    return dressing.light(image, depth, rays, rows)
+
+
+def _shaded(light: Tensor, clear: Tensor, layer: Layer, job: Job) -> tuple[Tensor, Tensor]:
     """Rows of the picture, and how far (linear light) their surfaces are from the airlight."""
-    airlight = image.new_tensor(job.ambience.airlight)
-    toned = batch_shade.toned_light(image, sky, rays, job.weather.overcast, job.ambience, air)
-    seen = layer.over(batch_shade.veiled(toned, clear, airlight))
-    gap = (toned.detach() - airlight[:, None, None]).abs().amax(dim=0)
+    airlight = light.new_tensor(job.ambience.airlight)
+    seen = layer.over(batch_shade.veiled(light, clear, airlight))
+    gap = (light.detach() - airlight[:, None, None]).abs().amax(dim=0)
     return batch_shade.encoded(seen), gap
 
 

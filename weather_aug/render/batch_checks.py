@@ -9,11 +9,20 @@ import torch
 from torch import Tensor
 
 from weather_aug.clip.types import Camera
+from weather_aug.edit.physical.layers import Layers
 from weather_aug.errors import ArgumentError
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 
 NOT_DRAWN = ("preset", "multiple_scattering")
-"""Options that `render` knows and a batch does not."""
+"""Options that `render` knows and a batch does not: it takes their default only."""
+UNDRAWN = (
+    *("lamps", "spray", "drops", "wipers", "lens_veil"),
+    *("noise", "glare", "compression"),
+)
+"""Effects that a batch does not draw; `without` must name them, so that nothing differs silently.
+"spray" is what single vehicles raise: the layer of spray over the road is drawn."""
+BATCH_OPTIONS = RenderOptions(without=UNDRAWN)
+"""All that a batch draws; `dataclasses.replace` makes others of it."""
 
 
 def check_tensors(images: Any, depth_m: Any, labels: Any) -> None:
@@ -111,6 +120,22 @@ def check_cameras(cameras: Sequence[Camera], images: Tensor) -> None:
             )
 
 
+def check_layers(layers: list[Layers | None], images: Tensor) -> list[Layers | None]:
+    """The layers, refused if one is of a picture of another size.
+
+    Raises:
+        ArgumentError: If one is.
+    """
+    size = tuple(images.shape[2:])
+    for known in layers:
+        if known is not None and known.classes.shape != size:
+            raise ArgumentError(
+                f"layers must be of pictures of the images' size {size}, got "
+                f"{known.classes.shape}; look at the cropped and resized pictures, or pass None"
+            )
+    return layers
+
+
 def check_options(options: Any) -> None:
     """Refuse what would be left out, because a silent difference from `render` is worse.
 
@@ -124,3 +149,9 @@ def check_options(options: Any) -> None:
             raise ArgumentError(
                 f"options.{name} = {getattr(options, name)!r} is not drawn in a batch; use render"
             )
+    asked = [effect for effect in UNDRAWN if options.has(effect)]
+    if asked:
+        raise ArgumentError(
+            f"options.without must name what a batch does not draw; add {', '.join(asked)}, start "
+            "from weather_aug.render.batch.BATCH_OPTIONS, or use render"
+        )

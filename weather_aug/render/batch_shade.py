@@ -1,4 +1,4 @@
-"""Tone, fog, encoding and labels of a picture in torch; the formulas of `weather_aug.render.shade`.
+"""Decoding, fog and encoding of a picture in torch; the formulas of `render.shade`.
 
 Differentiable with respect to the picture.
 """
@@ -7,58 +7,14 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn import functional
-
-from weather_aug.colour import LUMINANCE
-from weather_aug.edit.ambience import Ambience
-from weather_aug.edit.physical.overcast import ZENITH_GAIN, tone
-from weather_aug.render.batch_medium import AirColumn
-from weather_aug.render.label import (
-    DOUBTFUL_TRANSMITTANCE,
-    HAZY_TRANSMITTANCE,
-    LEAST_TRANSMITTANCE,
-    NEIGHBOURHOOD_PX,
-)
-from weather_aug.taxonomy import IGNORE, SKY
 
 
-def toned_light(
-    image: Tensor,
-    sky: Tensor,
-    rays: tuple[Tensor, Tensor],
-    overcast: float,
-    ambience: Ambience,
-    air: AirColumn,
-) -> Tensor:
-    """Linear light (3, H, W) of an sRGB picture (3, H, W) under the weather's sky.
+def decoded(image: Tensor, curve: Tensor) -> Tensor:
+    """Linear light (3, H, W) of an sRGB picture in [0, 1], by a table (256,) of its levels.
 
-    Args:
-        image: sRGB in [0, 1]; between 8-bit levels the tone curve is interpolated.
-        sky: (H, W) bool, where the sky may show.
-        rays: As `batch_medium.pixel_rays` gives them.
-        overcast: In [0, 1].
-        ambience: Light of the scene.
-        air: Knows which way is up.
+    Between 8-bit levels the table is interpolated; at a level the slope is that of the interval
+    above.
     """
-    curve, matrix = (image.new_tensor(part) for part in tone(overcast))
-    light = _decoded(image, curve)
-    if overcast == 0.0:
-        return light
-    luminance = (light * image.new_tensor(LUMINANCE)[:, None, None]).sum(dim=0)
-    brightest = 3.0 / max(float(ambience.sky @ LUMINANCE), 0.05)
-    matte = (luminance * brightest - 0.9).clamp(0.0, 1.0)
-    weight = overcast * torch.where(sky, matte, torch.zeros_like(matte))
-    ray_x, ray_y = rays
-    up_x, up_y, up_z = air.up_camera
-    sine = (up_x * ray_x + up_y * ray_y + up_z) / torch.sqrt(1.0 + ray_x * ray_x + ray_y * ray_y)
-    closed = image.new_tensor(ambience.airlight)[:, None, None] * (
-        1.0 + ZENITH_GAIN * sine.clamp(min=0.0)
-    )
-    light = torch.einsum("ij,jhw->ihw", matrix, light)
-    return light + weight * (closed - light)
-
-
-def _decoded(image: Tensor, curve: Tensor) -> Tensor:
     level = image * 255.0
     below = level.detach().floor().clamp(max=254.0)
     index = below.flatten().int()
@@ -78,35 +34,3 @@ def encoded(light: Tensor) -> Tensor:
     light = light.clamp(0.0, 1.0)
     power = 1.055 * light.clamp(min=0.0031308) ** (1.0 / 2.4) - 0.055
     return torch.where(light <= 0.0031308, 12.92 * light, power)
-
-
-def neighbourhood(mask: Tensor) -> Tensor:
-    """(H, W) bool: true where the mask is within 7 x 7 pixels."""
-    rim = NEIGHBOURHOOD_PX // 2
-    grown = functional.pad(mask, (rim, rim, rim, rim))
-    for side in (0, 1):
-        # Windows of 2, 4 and 7 pixels, each the union of two of the ones before.
-        for step in (1, 2, NEIGHBOURHOOD_PX - 4):
-            count = grown.shape[side] - step
-            grown = grown.narrow(side, 0, count) | grown.narrow(side, step, count)
-    return grown
-
-
-def readable(
-    label: Tensor | None, far: Tensor, through: Tensor, distinct: Tensor, covered: Tensor
-) -> tuple[Tensor | None, Tensor]:
-    """Label for training (H, W) and invalid mask (H, W) uint8, by the rules of `render.label`.
-
-    Args:
-        label: (H, W) train ids of the clear picture, or None.
-        far: (H, W) bool, where the depth is endless: the sky, where nobody labelled.
-        through: (H, W) share of the surface's light that reaches the pixel.
-        distinct: (H, W) bool, where it still differs visibly from the airlight.
-        covered: (H, W) bool, where a large particle hides the surface.
-    """
-    surface = ~far if label is None else label != SKY
-    near_distinct = neighbourhood(distinct & surface)
-    lost = (through < LEAST_TRANSMITTANCE) | ((through < HAZY_TRANSMITTANCE) & ~near_distinct)
-    unseen = (surface & lost) | covered
-    invalid = (unseen | (surface & (through < DOUBTFUL_TRANSMITTANCE))).to(torch.uint8)
-    return None if label is None else label.masked_fill(unseen, IGNORE), invalid

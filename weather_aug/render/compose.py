@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from weather_aug._keys import check_seed
 from weather_aug.air import Air, air_of
-from weather_aug.clip.types import Camera, Frame, FrameKey, Window
+from weather_aug.clip.types import Box, Camera, Frame, FrameKey, Window
 from weather_aug.edit.ambience import Ambience
 from weather_aug.edit.physical.layers import Layers
 from weather_aug.edit.surface import checked_window, depth_of, surface_of
@@ -30,6 +30,7 @@ from weather_aug.render.label_runs import small_things
 from weather_aug.render.label_snow import buried_borders, covered_faces, snow_limits
 from weather_aug.render.label_weight import loss_weight_of
 from weather_aug.render.lens import Glass
+from weather_aug.render.lens_wiper import CROSSING, wiper_of
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.render.scattering import scattering_margin_px
 from weather_aug.render.stage import Planes, Stage
@@ -158,9 +159,10 @@ def render(
 
 
 def warm_up() -> None:
-    """Compile or load all kernels now, before worker processes are started.
+    """Compile or load all kernels of a default render now, before worker processes are started.
 
-    A frame as a scene stores it (half-precision depth, a label) and one as a caller may pass it.
+    A labelled frame with half-precision depth, as a scene stores it, and an unlabelled one with
+    single precision, each with a car ahead, under all that falls, through a wiper and behind it.
     """
     intrinsics = np.array([[16.0, 0, 8], [0, 16, 8], [0, 0, 1]])
     camera = Camera(intrinsics, np.eye(4), 16, 16)
@@ -170,17 +172,33 @@ def warm_up() -> None:
     image = np.full((16, 16, 3), 128, np.uint8)
     depth = np.full((16, 16), 20.0)
     label = np.zeros((16, 16), np.uint8)
-    storm = Weather.mix(Weather.rain("heavy"), Weather.snow("heavy"))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = axes.T, (0.0, 0.75, 10.0)
+    car = Box(0, "car", pose, (4.5, 1.8, 1.5), np.array([0.0, 0.0, 12.0]))
+    both = Weather.mix(Weather.rain("heavy"), Weather.snow("heavy"))
+    storm = replace(both, wipers=1.0, lens_drops=500.0)
     roof = Shelter(np.full((8, 8), 3.0, np.float32), np.array([-2.0, -2.0, -5.0]), axes)
     patchy = Weather(visibility_m=50.0, fog_patchiness=0.5, fog_puffs=0.2)
     deep = Weather(visibility_m=18.0, snow_cover=1.0, road_snow_cover=1.0, snow_depth_m=0.2)
     label[:, 8:] = SIDEWALK
     label[2:4, :] = TRAIN_ID["traffic sign"]
-    for dtype in (np.float16, np.float32):
-        frame = Frame(FrameKey(0, "warm-up"), 0.0, camera, image, label, depth.astype(dtype))
-        render(frame, storm, seed=0, ambience=ambience, shelter=roof)
+    for dtype, known in ((np.float16, label), (np.float32, None)):
+        frame = Frame(
+            FrameKey(0, "warm-up"), 0.0, camera, image, known, depth.astype(dtype), boxes=(car,)
+        )
+        for time_s in _wiping_s(storm, camera):
+            moment = replace(frame, time_s=time_s)
+            render(moment, storm, seed=0, ambience=ambience, shelter=roof)
         render(frame, patchy, seed=0, ambience=ambience)
         render(frame, deep, seed=0, ambience=ambience)
+
+
+def _wiping_s(weather: Weather, camera: Camera) -> tuple[float, float]:
+    """When, at seed 0, the blade is before the picture, and when it has just passed."""
+    wiper = wiper_of(weather, camera, 0, 0, 0.0)
+    assert wiper is not None
+    crossing_s = CROSSING * wiper.period_s
+    return wiper.start_s + 0.5 * crossing_s, wiper.start_s + 2.0 * crossing_s
 
 
 def _clear(frame: Frame, window: Window) -> RenderedFrame:

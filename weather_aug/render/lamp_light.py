@@ -94,7 +94,11 @@ def add_lamps(
         _shine(lamp, patch, _DECAY, light)
         if lamp.streak > 0:
             _mirror(lamp, patch, mirrors, light)
-    _expose(np.ascontiguousarray(out[part]), light, _LINEAR, _BORDERS, out[part])
+    # Into an array of its own: the kernel would be compiled once more for a part of one.
+    dark = np.ascontiguousarray(out[part])
+    lit = dark.copy()
+    _expose(dark, light, _LINEAR, _BORDERS, lit)
+    out[part] = lit
     return out
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_args
 
 from weather_aug._checks import finite
@@ -86,6 +86,10 @@ class RenderOptions:
     def has(self, effect: str) -> bool:
         """Whether an effect is drawn."""
         return effect not in self.without
+
+    def to_dict(self) -> dict[str, Any]:
+        """Fields as JSON values; `RenderOptions(**fields)` is equal to these options."""
+        return asdict(self) | {"without": list(self.without)}
 
     @property
     def needs_rig(self) -> bool:

@@ -6,7 +6,6 @@ import json
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -242,6 +241,6 @@ def _recipe(
             "weather": draw.weather.to_dict(),
             "seed": draw.seed,
             "window": window,
-            "options": asdict(options),
+            "options": options.to_dict(),
         }
     )

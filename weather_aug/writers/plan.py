@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import accumulate
 from typing import Any, NamedTuple
@@ -76,7 +76,7 @@ class ExportPlan:
             "policy": self.policy.to_dict(),
             "seed": self.seed,
             "count": self.count,
-            "options": asdict(self.options),
+            "options": self.options.to_dict(),
         }
 
     @cached_property
@@ -117,7 +117,7 @@ class ExportPlan:
             "severity": item.draw.severity,
             "weather": item.draw.weather.to_dict(),
             "seed": item.draw.seed,
-            "options": asdict(self.options),
+            "options": self.options.to_dict(),
             "package_version": weather_aug.__version__,
             "format_version": layout.VERSION,
         }

@@ -23,9 +23,6 @@ from weather_aug.edit.physical.spread import spread_run
 from weather_aug.edit.physical.standing_rows import NO_CAP_M, caps_row, film_run, standing_run
 from weather_aug.edit.surface import depth_row
 
-CAP_ROWS = 96
-"""How far above a window the upper edges of things are looked for, pixels."""
-
 MAPS = 18
 """Those of `layers`, but what is mirrored is three colours under the weather's light, twice."""
 OBJECT_GAINS = (np.float32(LEAST_GAIN), np.float32(MOST_GAIN))
@@ -107,7 +104,8 @@ def dress(
     snowy = (look.snow > zero) | (look.road_snow > zero)
     pools = (look.puddles > zero) & (look.mirror > zero)
     wet = (look.film > zero) | (look.mirror > zero)
-    start = max(top - CAP_ROWS, 0) if look.snow > zero else top
+    # Upper edges are found from the top of the picture on.
+    start = 0 if look.snow > zero else top
     for y in range(start, top + height):
         depth_row(surface, y, left, bits, depth)
         first = y * surface.width + left

@@ -29,6 +29,8 @@ from weather_aug.edit.physical.spread import spread_run
 LANE_M, WHEEL_M, TRACK_M = 3.5, 0.75, 0.28
 """Width of a lane, wheels from its middle, half the width of a track."""
 SNOW_ALBEDO, ASPHALT_ALBEDO = 0.85, 0.12
+SHARPEST = 1e-3
+"""Of the border of a cover, in noise."""
 WANDER_M = 0.16
 """How far tracks wander within the width of a lane."""
 TRACK_COVER, TRACK_SOFTNESS = 0.15, 0.16
@@ -59,10 +61,16 @@ def ramp(low, high, value):
 
 @inlined
 def covered(amount, fuzz, noise):
-    """How far a place of this noise is covered when a share `amount` of all places is."""
-    one = np.float32(1.0)
-    threshold = one + fuzz - amount * (one + np.float32(2.0) * fuzz)
-    return ramp(threshold - fuzz, threshold + fuzz, noise)
+    """How far a place of this noise is covered when a share `amount` of all places is.
+
+    `fuzz` is how soft borders are; it gives way where a border would leave the noise's range, so
+    that the mean over all places is the amount.
+    """
+    one, least = np.float32(1.0), np.float32(SHARPEST)
+    soft = min(fuzz, min(amount, one - amount))
+    soft = soft if soft > least else least
+    threshold = one + least - amount * (one + np.float32(2.0) * least)
+    return ramp(threshold - soft, threshold + soft, noise)
 
 
 @compiled
@@ -93,7 +101,7 @@ def ground_run(run, depth, geometry, look, material, small, cell, share, b):
         spread_run(small, LATERAL_M, 1, cell, share, x0, x1, b, SIDE)
         _tracks(x0, x1, look.tracks if road else zero, b)
     if look.film > zero:
-        film(x0, x1, look.film * material[POROSITY], b)
+        film(x0, x1, look.film * material[POROSITY], look.exposure, b)
     if shine > zero:
         spread_run(small, SHARP, 6, cell, share, x0, x1, b, MIRRORED)
         _pools(x0, x1, pools, b)
@@ -146,13 +154,13 @@ def _tracks(x0, x1, strength, b):
 
 
 @compiled
-def film(x0, x1, wet, b):
+def film(x0, x1, wet, exposure, b):
     """Darken a run under a film of water."""
     least, most, one = np.float32(0.01), np.float32(0.95), np.float32(1.0)
     for channel in range(3):
         for x in range(x0, x1):
             value = b[channel, x]
-            albedo = value / max(b[LIT, x], np.float32(0.02))
+            albedo = value / (exposure * max(b[LIT, x], np.float32(0.02)))
             albedo = min(max(albedo, least), most)
             b[channel, x] = value * (one + wet * (film_ratio_of(albedo) - one))
 
@@ -212,7 +220,7 @@ def _lay(x0, x1, look, least, b):
     for x in range(x0, x1):
         light = b[LIT, x]
         bright = snow_light(light, look)
-        under = luminance(b[R, x], b[G, x], b[B, x]) / (asphalt * light)
+        under = luminance(b[R, x], b[G, x], b[B, x]) / (asphalt * look.exposure * light)
         under = under if under < np.float32(2.0) else np.float32(2.0)
         shade = least + (np.float32(1.02) - least) * b[NOISE, x]
         shade *= np.float32(1.0 - SHOWING_THROUGH) + np.float32(SHOWING_THROUGH) * under

@@ -248,9 +248,10 @@ def _lit_level(site: Site, base: Float32, ground: Bool) -> Float32:
     lit = np.zeros(site.shape, np.float32)
     edges = np.log(DISTANCE_BINS_M).astype(np.float32)
     centres = 0.5 * (edges[1:] + edges[:-1])
-    # Every other row and column tell as much.
-    some_ground, some_classes = ground[::2, ::2], site.small_classes[::2, ::2]
-    some_base, some_depth = base[::2, ::2], site.depth_m[::2, ::2]
+    # Every other row and column tell as much, if they see any of it.
+    part = (slice(None, None, 2),) * 2 if ground[::2, ::2].any() else (slice(None),) * 2
+    some_ground, some_classes = ground[part], site.small_classes[part]
+    some_base, some_depth = base[part], site.depth_m[part]
     whole = _lit_median(some_base[some_ground])
     for name in GROUND:
         mine = some_ground & (some_classes == name)

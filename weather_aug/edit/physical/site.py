@@ -248,7 +248,8 @@ def _classes(frame: Frame, axes_world: Float64, plane: Float64) -> UInt8:
     out = np.empty(frame.image.shape[:2], np.uint8)
     _guess(
         cv2.blur(frame.image, (COLOUR_BLUR_PX, COLOUR_BLUR_PX)),
-        np.ascontiguousarray(np.asarray(frame.depth_m, np.float32)),
+        # A copy, because the kernel would be compiled once more for what may not be written.
+        np.array(frame.depth_m, np.float32, order="C"),
         np.array(numbers, np.float32),
         out,
     )

@@ -86,8 +86,12 @@ def smear(ends, twice, spread, view, slope, out):
                     across[j, k] = down[j, k] / down[j, 3]
         _on_columns(across, np.float32(row), view, out[row])
         lowest = row
+    if lowest == height:
+        # The whole picture is above the horizon: nothing in it mirrors.
+        out[:] = np.float32(0.0)
+        return
     for row in range(lowest):
-        out[row] = out[min(lowest, height - 1)]
+        out[row] = out[lowest]
 
 
 @inlined

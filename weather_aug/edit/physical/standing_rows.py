@@ -61,7 +61,7 @@ def film_run(run, look, material, small, cell, share, b):
     """Darken wet walls, trunks and clothes."""
     x0, x1, _, _ = run
     spread_run(small, ILLUMINATION, 1, cell, share, x0, x1, b, LIT)
-    film(x0, x1, look.film * material[POROSITY], b)
+    film(x0, x1, look.film * material[POROSITY], look.exposure, b)
 
 
 @compiled
@@ -80,11 +80,12 @@ def standing_run(run, depth, geometry, look, material, small, cell, share, b):
             _levels(x0, x1, amount, b)
     buries = look.snow * material[BURIED]
     grey = luminance(look.red, look.green, look.blue)
-    leaf = material[LEAF] > zero
+    leaf, tiny = material[LEAF] > zero, np.float32(1e-6)
     for x in range(x0, x1):
         noise = b[NOISE, x]
         buried = look.snow_depth_m * (np.float32(0.6) + np.float32(0.8) * noise)
-        cover = max(b[COVERED, x], buries if b[HEIGHT, x] < buried else zero)
+        lies = one - ramp(np.float32(0.7) * buried, np.float32(1.1) * buried + tiny, b[HEIGHT, x])
+        cover = max(b[COVERED, x], buries * lies)
         light = max(b[LIT, x], np.float32(0.02))
         bright = snow_light(light, look) * (np.float32(0.81) + np.float32(0.11) * noise)
         dim = np.float32(0.25) + np.float32(4.0) * b[MEAN, x] / light
@@ -109,12 +110,13 @@ def _feet(run, depth, geometry, b):
 
 @compiled
 def _edges(x0, x1, cap_m, snow_depth_m, b):
-    """Snow along upper edges."""
-    one = np.float32(1.0)
+    """Snow along upper edges: how much of each pixel lies within it."""
+    zero, one = np.float32(0.0), np.float32(1.0)
     for x in range(x0, x1):
         edge = cap_m * (np.float32(0.6) + np.float32(0.8) * b[NOISE, x])
-        edge += np.float32(0.4) * snow_depth_m + np.float32(1e-6)
-        b[COVERED, x] = one - ramp(np.float32(0.7) * edge, np.float32(1.2) * edge, b[BELOW_TOP, x])
+        edge += np.float32(0.4) * snow_depth_m
+        within = (edge - b[BELOW_TOP, x]) / max(b[SIZE, x], np.float32(1e-5))
+        b[COVERED, x] = min(max(within, zero), one)
 
 
 @compiled

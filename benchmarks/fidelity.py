@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.overlays import RAIN, SNOW
+from benchmarks.overlays import RAIN, SNOW, air_only
 from benchmarks.report import Row, show
 from benchmarks.scene import AXES, street
 from weather_aug.air import air_of
@@ -19,12 +19,12 @@ from weather_aug.particles.resolve import DEPTH_BINS, FAR_M
 from weather_aug.render.compose import render
 from weather_aug.render.fields import fields_of
 from weather_aug.render.light import particle_colour
-from weather_aug.render.options import RenderOptions
 from weather_aug.weather import Weather
 
 ORACLES = Path(__file__).parents[1] / "tests" / "oracles"
 HEIGHT, WIDTH = 96, 192
-OPTIONS = RenderOptions(1_500)
+OPTIONS = air_only(1_500)
+"""The reference knows the air and its particles, and no effect besides."""
 SEED = 1
 WEATHERS = {"fog + rain": RAIN, "fog + snow": SNOW}
 

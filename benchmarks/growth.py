@@ -1,4 +1,4 @@
-"""How the cost grows with the number of particles and with the number of pixels."""
+"""How the cost grows with the number of particles and of pixels; of the air alone."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 
 from benchmarks.crowds import KINDS
 from benchmarks.drawn import drawn
-from benchmarks.overlays import CASES, FOG, IN_VIEW, peers
+from benchmarks.overlays import CASES, FOG, IN_VIEW, air_only, peers, renders
 from benchmarks.scene import street
 from benchmarks.timing import interleaved
 from weather_aug.particles.field import MAX_PARTICLES
+from weather_aug.render.background import looked_at
 from weather_aug.render.compose import render
-from weather_aug.render.options import RenderOptions
 
 HEIGHT, WIDTH = 1080, 1920
 MOST = MAX_PARTICLES // 2
@@ -56,11 +56,11 @@ def by_particles() -> dict[str, Any]:
     The fit leaves out counts that add less than a quarter: there fixed costs and noise rule.
     """
     frame, ambience = street(HEIGHT, WIDTH)
-    call = partial(render, frame, seed=1, ambience=ambience)
-    runs: dict[str, Callable[[], object]] = {"fog": partial(call, FOG, options=RenderOptions(0))}
+    call = partial(render, frame, seed=1, ambience=ambience, layers=looked_at(frame, ambience))
+    runs: dict[str, Callable[[], object]] = {"fog": partial(call, FOG, options=air_only(0))}
     for kind, weather in KINDS.items():
         for budget in (0, *BUDGETS):
-            runs[f"{kind} {budget}"] = partial(call, weather, options=RenderOptions(budget))
+            runs[f"{kind} {budget}"] = partial(call, weather, options=air_only(budget))
     others = peers()
     runs |= {name: partial(others[name], image=frame.image) for name in SLOW_PEERS}
     ms = interleaved(runs, ROUNDS)
@@ -89,17 +89,8 @@ def by_pixels() -> dict[str, Any]:
     counts: dict[str, list[int]] = {name: [] for name in BY_PIXELS if CASES[name][1]}
     for height, width in SIZES:
         frame, ambience = street(height, width)
-        ours = {
-            name: partial(
-                render,
-                frame,
-                CASES[name][0],
-                seed=1,
-                ambience=ambience,
-                options=RenderOptions(CASES[name][1]),
-            )
-            for name in BY_PIXELS
-        }
+        cases = renders(frame, ambience, looked_at(frame, ambience))
+        ours = {name: cases[name] for name in BY_PIXELS}
         others = peers()
         theirs = {name: partial(others[name], image=frame.image) for name in SLOW_PEERS}
         for name, value in (interleaved(ours, ROUNDS) | interleaved(theirs, SLOW_ROUNDS)).items():

@@ -5,6 +5,9 @@ depth beside the picture (there is no option to leave them out); the peers retur
 meant by 20,000 particles has two readings. "In a box": of 20,000 particles in a box of 18 x 10 x
 20 m in front of the camera about 6,500 are in view and drawn. "Drawn": 20,000 are in view and
 drawn, in rain and snow dense enough to need that many.
+
+The peers draw what is in the air, so these contenders do, too: every effect on background, glass
+and camera is left out. Beside them stand whole renders of heavy weather with all of it.
 """
 
 from __future__ import annotations
@@ -22,8 +25,12 @@ from benchmarks.drawn import Drawn, drawn
 from benchmarks.report import Row, show
 from benchmarks.scene import street
 from benchmarks.timing import interleaved
+from weather_aug.clip.types import Frame
+from weather_aug.edit.ambience import Ambience
+from weather_aug.edit.physical.layers import Layers
+from weather_aug.render.background import looked_at
 from weather_aug.render.compose import render
-from weather_aug.render.options import RenderOptions
+from weather_aug.render.options import EFFECTS, RenderOptions
 from weather_aug.weather import Weather
 
 HEIGHT, WIDTH = 512, 1024
@@ -40,6 +47,12 @@ CASES = {
     "fog + snow 6.5k": (SNOW, IN_BOX),
     "fog + snow 20k": (SNOW, IN_VIEW),
 }
+WHOLE = {
+    "whole rain (heavy)": Weather.rain("heavy"),
+    "whole snow (heavy)": Weather.snow("heavy"),
+    "whole fog (heavy)": Weather.fog("heavy"),
+}
+"""Default renders: edited background, air, particles, lamps, spray, glass and camera."""
 COPY, FAR_COPY = "copy of the frame, in cache", "copy of the frame, in memory"
 FAR_BYTES = 2**27
 """Frames of this many bytes are copied in turns, so that none is still in the cache."""
@@ -60,14 +73,26 @@ def peers() -> dict[str, A.BasicTransform | A.Compose]:
     return found
 
 
-def renders(frame: Any, ambience: Any) -> dict[str, Callable[[], object]]:
-    """A call of `render` for each case."""
+def air_only(max_particles: int) -> RenderOptions:
+    """The medium and its particles, and nothing else that weather does to a picture."""
+    return RenderOptions(max_particles, without=EFFECTS)
+
+
+def renders(frame: Frame, ambience: Ambience, layers: Layers) -> dict[str, Callable[[], object]]:
+    """A call of `render` for each case, of the air alone."""
+    call = partial(render, frame, seed=1, ambience=ambience, layers=layers)
     return {
-        name: partial(
-            render, frame, weather, seed=1, ambience=ambience, options=RenderOptions(budget)
-        )
+        name: partial(call, weather, options=air_only(budget))
         for name, (weather, budget) in CASES.items()
     }
+
+
+def whole_renders(
+    frame: Frame, ambience: Ambience, layers: Layers | None
+) -> dict[str, Callable[[], object]]:
+    """A call of `render` for each whole weather; without layers it looks at the frame itself."""
+    call = partial(render, frame, seed=1, ambience=ambience, layers=layers)
+    return {name: partial(call, weather) for name, weather in WHOLE.items()}
 
 
 def measure() -> list[dict[str, Any]]:
@@ -77,12 +102,14 @@ def measure() -> list[dict[str, Any]]:
 
 def _measured(height: int, width: int) -> dict[str, Any]:
     frame, ambience = street(height, width)
-    ours = renders(frame, ambience)
+    layers = looked_at(frame, ambience)
+    ours = renders(frame, ambience, layers)
     counts = {name: drawn(run, height, width) for name, run in ours.items() if CASES[name][1] > 0}
+    whole = whole_renders(frame, ambience, layers)
     others = {name: partial(peer, image=frame.image) for name, peer in peers().items()}
     others[COPY] = partial(np.copyto, np.empty_like(frame.image), frame.image)
     others[FAR_COPY] = _copies_in_turns(frame.image)
-    ms = interleaved(ours | others)
+    ms = interleaved(ours | whole | others)
     print(f"\n{height} x {width}: milliseconds, and what is drawn")
     for name, value in ms.items():
         print(f"  {name:30s} {value:8.2f} ms{_count_text(counts.get(name))}")
@@ -95,7 +122,7 @@ def _measured(height: int, width: int) -> dict[str, Any]:
 
 
 def ratios(ms: Mapping[str, float]) -> list[Row]:
-    """The ratios that have targets; those of particles in both readings."""
+    """The ratios that have targets, particles in both readings; then whole renders, without."""
     rows = [
         Row(
             "fog against RandomFog (0.5-0.8)",
@@ -124,6 +151,11 @@ def ratios(ms: Mapping[str, float]) -> list[Row]:
                 at_least=10,
             ),
         ]
+    slow = ms["RandomSnow (texture)"] + ms["RandomFog (0.5-0.8)"]
+    rows += [Row(f"{name} / fog pass", ms[name] / ms["fog"], "x") for name in WHOLE]
+    rows += [
+        Row(f"{name} against RandomSnow + RandomFog", slow / ms[name], "x faster") for name in WHOLE
+    ]
     return rows
 
 

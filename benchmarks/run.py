@@ -12,7 +12,7 @@ import cv2
 import numba
 import torch
 
-from benchmarks import crowds, fidelity, growth, overlays, plot, sample, stages
+from benchmarks import crowds, editing, fidelity, growth, overlays, plot, sample, stages
 from benchmarks.report import write_results
 
 OUT = Path("out/bench")
@@ -25,6 +25,7 @@ def main() -> None:
     numba.set_num_threads(1)
     results = {
         "overlays": overlays.measure(),
+        "editing": editing.measure(),
         "crowds": crowds.measure(),
         "fidelity": fidelity.measure(),
         "sample": sample.measure(),

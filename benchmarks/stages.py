@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from functools import wraps
 from statistics import median
@@ -13,16 +13,18 @@ from unittest.mock import patch
 
 import cv2
 
-from benchmarks.overlays import CASES, SIZES, renders
+from benchmarks.overlays import SIZES, renders, whole_renders
 from benchmarks.scene import street
 from weather_aug.particles.field import ParticleField
-from weather_aug.render import compose, fields, stage
+from weather_aug.render import background, compose, fields, stage, taken
+from weather_aug.render.background import looked_at
 
-STAGES: dict[str, tuple[Any, str]] = {
-    "read": (compose, "surface_of"),
+Stages = Mapping[str, tuple[Any, str]]
+STAGES: Stages = {
     "air": (compose, "air_of"),
     "look at the frame": (compose, "looked_at"),
-    "background": (compose, "background_of"),
+    "edit": (background, "edited"),
+    "read": (background, "surface_of"),
     "resolve": (ParticleField, "resolve"),
     "enumerate": (ParticleField, "particles"),
     "shelter": (fields, "exposed"),
@@ -31,7 +33,10 @@ STAGES: dict[str, tuple[Any, str]] = {
     "split": (stage, "split_by_band"),
     "shade": (stage, "shade"),
     "merge": (cv2, "merge"),
-    "glass and sensor": (compose, "taken"),
+    "vehicles": (compose, "traffic_of"),
+    "shrunken picture": (taken, "_whole"),
+    "glass": (taken, "through_glass"),
+    "sensor": (taken, "exposed"),
     "labels": (compose, "readable_labels"),
 }
 """Functions whose time is taken where `render` looks them up; the first are called first."""
@@ -63,22 +68,24 @@ class StageClock:
         return run
 
     @contextmanager
-    def watching(self) -> Iterator[None]:
+    def watching(self, stages: Stages = STAGES) -> Iterator[None]:
         """Time the stages while the block runs."""
         with ExitStack() as stack:
-            for name, (owner, attribute) in STAGES.items():
+            for name, (owner, attribute) in stages.items():
                 original = getattr(owner, attribute)
                 stack.enter_context(patch.object(owner, attribute, self.timed(name, original)))
             yield
 
 
-def stage_ms(run: Callable[[], object], rounds: int = ROUNDS) -> dict[str, float]:
-    """Median milliseconds of each stage of a call of `render`, and of all else."""
+def stage_ms(
+    run: Callable[[], object], rounds: int = ROUNDS, stages: Stages = STAGES
+) -> dict[str, float]:
+    """Median milliseconds of each stage of a call, such as of `render`, and of all else."""
     run()
-    spent: dict[str, list[float]] = {name: [] for name in (*STAGES, REST)}
+    spent: dict[str, list[float]] = {name: [] for name in (*stages, REST)}
     for _ in range(rounds):
         clock = StageClock()
-        with clock.watching():
+        with clock.watching(stages):
             clock.timed(REST, run)()
         for name, values in spent.items():
             values.append(1e3 * clock.seconds[name])
@@ -86,19 +93,30 @@ def stage_ms(run: Callable[[], object], rounds: int = ROUNDS) -> dict[str, float
 
 
 def measure() -> list[dict[str, Any]]:
-    """Print the stages of each case at both sizes."""
+    """Print the stages of each case of the air at both sizes, and those of whole renders."""
     results = []
     for height, width in SIZES:
-        table = {name: stage_ms(run) for name, run in renders(*street(height, width)).items()}
-        print(f"\n{height} x {width}: where the time goes, ms")
-        print(" " * 36 + "".join(f"{name:>18s}" for name in CASES))
-        for stage_name in (*STAGES, REST):
-            values = "".join(f"{table[case][stage_name]:18.2f}" for case in CASES)
-            print(f"  {stage_name:34s}{values}")
-        whole = "".join(f"{sum(table[case].values()):18.2f}" for case in CASES)
-        print(f"  {'sum':34s}{whole}", flush=True)
-        results.append({"size": [height, width], "ms": table})
+        frame, ambience = street(height, width)
+        layers = looked_at(frame, ambience)
+        for kind, calls in (
+            ("the air alone", renders(frame, ambience, layers)),
+            ("whole renders", whole_renders(frame, ambience, None)),
+        ):
+            table = {name: stage_ms(run) for name, run in calls.items()}
+            show_table(f"{height} x {width}, {kind}: where the time goes, ms", table)
+            results.append({"size": [height, width], "kind": kind, "ms": table})
     return results
+
+
+def show_table(title: str, table: Mapping[str, Mapping[str, float]]) -> None:
+    """Print milliseconds by column and row, and their sums; rows that cost nothing are left out."""
+    print(f"\n{title}")
+    print(" " * 36 + "".join(f"{name:>20s}" for name in table))
+    for row in next(iter(table.values())):
+        if any(column[row] >= 0.005 for column in table.values()):
+            print(f"  {row:34s}" + "".join(f"{column[row]:20.2f}" for column in table.values()))
+    whole = "".join(f"{sum(column.values()):20.2f}" for column in table.values())
+    print(f"  {'sum':34s}{whole}", flush=True)
 
 
 if __name__ == "__main__":

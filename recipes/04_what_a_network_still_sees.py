@@ -19,16 +19,14 @@ import numpy as np
 import weather_aug as wa
 from weather_aug.clip.labelled import Teacher
 from weather_aug.errors import ArgumentError, MissingExtraError
+from weather_aug.render.options import EFFECTS
 from weather_aug.scene.policy import TYPES, weather_of
 from weather_aug.scores.agreement import Agreement, agreement
 from weather_aug.severity import NAMED_SEVERITIES
 from weather_aug.taxonomy import SKY
 
 NONE = Agreement(np.zeros((19, 19), np.int64))
-RISE, STEP = 0.01, 0.7
-"""A steady fall never rises by more; of a smooth one no step is a larger share."""
-# Without particles their veil stays: what is not drawn becomes extinction.
-WITHOUT = {"nothing": wa.RenderOptions(), "particles": wa.RenderOptions(max_particles=0)}
+RISE, STEP = 0.01, 0.7  # A steady fall never rises by more; no step of a smooth one is more of it.
 
 
 def teacher(weights: Path) -> Teacher:
@@ -60,10 +58,13 @@ def compare(scene: wa.WeatherScene, see: Teacher, given: argparse.Namespace) -> 
     clear = {key: see(scene.frame(key).image.copy()) for key in keys}
     # A blue sky that passes for a building is no label to keep: depth knows what is sky.
     sure = {key: (clear[key] == SKY) == np.isinf(scene.frame(key).depth_m) for key in keys}
-    share = np.mean([mask.mean() for mask in sure.values()])
-    print(f"{scene.name}, {len(keys)} frames, {share:.0%} of pixels, without {given.without}")
+    share, out = np.mean([mask.mean() for mask in sure.values()]), " ".join(given.without)
+    print(f"{scene.name}, {len(keys)} frames, {share:.0%} of pixels, without {out or 'nothing'}")
     print(f"{'':16}agreement  flipped     mIoU  agreement where visible")
-    options, found = WITHOUT[given.without], list[list[float]]()
+    # Without particles their veil stays: what is not drawn becomes extinction.
+    count = 0 if "particles" in given.without else wa.RenderOptions.max_particles
+    options = wa.RenderOptions(count, without=tuple(set(given.without) & set(EFFECTS)))
+    found: list[list[float]] = []
     for kind in given.weathers:
         found.append([])
         for severity in given.severities:
@@ -75,7 +76,7 @@ def compare(scene: wa.WeatherScene, see: Teacher, given: argparse.Namespace) -> 
                 visible += agreement(clear[key], seen, mask=sure[key] & (shot.invalid == 0))
             found[-1].append(total.pixel_agreement)
             row = total.pixel_agreement, total.flipped, total.miou, visible.pixel_agreement
-            print(f"{kind + ' ' + severity:16}" + "".join(f"{value:9.3f}" for value in row))
+            print(f"{kind + ' ' + severity:16}" + "".join(f"{v:9.3f}" for v in row), flush=True)
         print(f"{kind}: {verdict(found[-1])}")
     return found
 
@@ -99,15 +100,14 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--weathers", nargs="+", default=list(TYPES[1:]))
     parser.add_argument("--severities", nargs="+", default=list(NAMED_SEVERITIES))
     parser.add_argument("--frames", type=int, default=4, help="of each scene, evenly apart")
-    parser.add_argument("--without", choices=list(WITHOUT), default="nothing")
+    parser.add_argument("--without", choices=("particles", *EFFECTS), nargs="+", default=[])
     return parser.parse_args(words)
 
 
 def main() -> None:
     """Compare on the scenes given, or on a small street."""
     given = arguments()
-    see = teacher(given.weights)
-    scenes = [wa.WeatherScene.load(path) for path in given.scenes]
+    see, scenes = teacher(given.weights), [wa.WeatherScene.load(path) for path in given.scenes]
     with tempfile.TemporaryDirectory() as folder:
         if not scenes:
             clip = wa.open_clip("street:?frames=2&width=320&height=180")

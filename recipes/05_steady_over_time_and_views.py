@@ -3,8 +3,8 @@
 python recipes/05_steady_over_time_and_views.py scenes/kitti02 scenes/ddad02
 
 Prints the warp error of the clear clip, of its weathers, and their ratio. What moves by nature is
-left out: rain and snow have fallen (`falling=False`), or with --veil they fall, but no particle is
-drawn (`max_particles=0`). Without scenes a small procedural street is built.
+left out: particles, rings on water, spray, what is on the glass and in the sensor; --without alone
+leaves out only the particles. Without scenes a small procedural street is built.
 """
 
 from __future__ import annotations
@@ -18,13 +18,22 @@ from pathlib import Path
 import numpy as np
 
 import weather_aug as wa
-from weather_aug.scene.policy import weather_of
+from weather_aug.render.options import EFFECTS
 from weather_aug.scores.warp import WarpError, correspondence
 
-PROMISE = 1.1
-"""An edited background's error is at the most this times the clear one's."""
-MIN_SHARE = 0.01
-"""Cameras that have less than this in common do not overlap."""
+PROMISE, MIN_SHARE = 1.1, 0.01
+"""An edited background's error is at the most 1.1 times the clear one's; cameras that have less
+than 1 % in common do not overlap."""
+MOVING = ("ripples", "spray", "drops", "wipers", "lens_veil", "noise", "glare", "compression")
+"""Not of the street: these move with time, the glass or the sensor."""
+WEATHERS = {
+    "wet road": lambda s: wa.Weather.rain(s, falling=False),
+    "fresh snow": lambda s: wa.Weather.snow(s, falling=False),
+    "overcast": lambda s: wa.Weather(overcast=wa.Weather.rain(s).overcast),
+    "fog": wa.Weather.fog,
+    "rain": wa.Weather.rain,
+    "snowfall": wa.Weather.snow,
+}
 
 Pair = tuple[wa.FrameKey, wa.FrameKey]
 
@@ -69,8 +78,7 @@ def report(found: dict[str, list[WarpError]]) -> dict[str, float]:
         for name, each in found.items()
     }
     contrast = {name: np.mean([e.contrast for e in each]) for name, each in found.items()}
-    share = np.mean([error.share for error in clear])
-    print(f"  {len(clear)} pairs, {share:.0%} of the pixels compared")
+    print(f"  {len(clear)} pairs, {np.mean([e.share for e in clear]):.0%} of the pixels compared")
     print(f"  {'':16}absolute  ratio  per contrast  squared  ratio")
     ratios = {}
     for name in found:
@@ -87,18 +95,14 @@ def main() -> None:
     """Report on the scenes given, or on a small street."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scenes", type=Path, nargs="*")
-    parser.add_argument("--weathers", nargs="+", default=["rain", "snow", "fog"])
-    parser.add_argument("--severities", nargs="+", default=["moderate", "extreme"])
-    parser.add_argument("--veil", action="store_true", help="falling, but without particles")
+    parser.add_argument("--weathers", nargs="+", choices=WEATHERS, default=list(WEATHERS))
+    parser.add_argument("--severity", default="heavy")
+    parser.add_argument("--without", nargs="*", choices=EFFECTS, default=MOVING)
     parser.add_argument("--sky", choices=["out", "rotation"], default="out")
     parser.add_argument("--times", type=int, nargs="*", help="first time indices; all if not given")
     given = parser.parse_args()
-    weathers = {
-        f"{kind} {severity}": weather_of(kind, severity, falling=given.veil)
-        for kind in given.weathers
-        for severity in given.severities
-    }
-    options = wa.RenderOptions(max_particles=0)
+    weathers = {name: WEATHERS[name](given.severity) for name in given.weathers}
+    options = wa.RenderOptions(max_particles=0, without=tuple(given.without))
     with tempfile.TemporaryDirectory() as folder:
         scenes = [wa.WeatherScene.load(path) for path in given.scenes]
         if not scenes:

@@ -61,7 +61,7 @@ def _with_look(**changes):
     return wrong
 
 
-TONE_TABLES = module._tone_tables
+TONE_TABLES = module.tone_tables
 FAULTS = {
     "more of the road flooded": ("wet", "look_of", _with_look(flooded=lambda v: v + 0.1)),
     "half the film": ("wet", "look_of", _with_look(film=lambda v: 0.8 * v)),
@@ -76,7 +76,7 @@ FAULTS = {
     "dry pavements": ("wet", "material_table", with_material("sidewalk", mirror=0.0)),
     "a metre aside": ("heavy snow", "geometry_of", with_geometry(left_0=lambda v: v + 1)),
     "half a pixel up": ("puddles", "geometry_of", with_geometry(cy=lambda v: v + 2)),
-    "no tone": ("overcast", "_tone_tables", lambda overcast: TONE_TABLES(0.0)),
+    "no tone": ("overcast", "tone_tables", lambda overcast: TONE_TABLES(0.0)),
 }
 
 
@@ -261,7 +261,7 @@ def test_every_level_of_every_channel_comes_back():
 
 
 def test_a_tone_left_on_is_found(monkeypatch):
-    monkeypatch.setattr(module, "_tone_tables", lambda overcast: TONE_TABLES(max(overcast, 0.1)))
+    monkeypatch.setattr(module, "tone_tables", lambda overcast: TONE_TABLES(max(overcast, 0.1)))
     with pytest.raises(AssertionError):
         check_identity(street(), Weather())
 

@@ -34,9 +34,9 @@ def tone(weather, without):
 
     def curve(light):
         gain = 1 - 0.15 * o * (1 - 0.8)
-        return gain * GREY * (light / GREY) ** (1 - 0.25 * o) if o else light
+        return gain * GREY * (light / GREY) ** (1 - 0.18 * o) if o else light
 
-    saturation, white = 1 - 0.35 * o, 1 + o * (np.array([0.96, 1.0, 1.05]) - 1)
+    saturation, white = 1 - 0.28 * o, 1 + o * (np.array([0.96, 1.0, 1.05]) - 1)
     matrix = saturation * np.eye(3) + (1 - saturation) * WEIGHTS[None, :]
     return curve, white[:, None] * matrix
 
@@ -218,7 +218,7 @@ def edited(frame, layers, weather, ambience, without=()):
     light = curve(linear(frame.image))
     overcast = weather.overcast if has("relight") else 0.0
     ground = np.isin(kinds, GROUND)
-    strength = overcast * (1 - 0.25 * overcast)
+    strength = overcast * (1 - 0.18 * overcast)
     luma = image @ WEIGHTS
     lines = at("ground_slope") * luma + at("ground_offset")
     lines = np.minimum(np.maximum(lines, at("ground_least")), at("ground_most")) * strength
@@ -292,7 +292,7 @@ def edited(frame, layers, weather, ambience, without=()):
             if amount > 0:
                 rut = tracks if is_road else np.zeros(shape)
                 softer = taste.TRACK_SOFTNESS if is_road else 0.0
-                share = cover(amount * (1 - (1 - taste.TRACK_COVER) * rut), fuzz + softer, value)
+                share = (1 - (1 - taste.TRACK_COVER) * rut) * cover(amount, fuzz + softer, value)
                 under = np.minimum(now @ WEIGHTS / (0.12 * gain * lit), 2.0)
                 least = taste.SLUSH if is_road else taste.CLEAN
                 shade = (least + (1.02 - least) * value) * (1 - taste.SHOWING_THROUGH * (1 - under))
@@ -303,7 +303,7 @@ def edited(frame, layers, weather, ambience, without=()):
             if material.leaf > 0:
                 usual = np.maximum(mean, 0.002)
                 detail = np.clip(0.5 + 0.7 * (now @ WEIGHTS / (usual * gain) - 1), 0, 1)
-                share = cover(0.8 * amount, 0.2, 0.25 * on_walls + 0.75 * detail)
+                share = cover(0.8 * amount, 0.5, 0.25 * on_walls + 0.75 * detail)
                 lies = lies * np.minimum(0.25 + 4 * mean / np.maximum(lit, 0.02), 0.85)
             else:
                 uneven = 0.6 + 0.8 * on_walls

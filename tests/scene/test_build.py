@@ -523,11 +523,12 @@ def test_layers_of_another_look_are_thrown_away(
 ) -> None:
     """A planted fault: the editor looked at frames otherwise when the work was cut."""
     seen = building.layers_seen
+    aside = np.array([[0.0, 3.0], [1.0, 3.0]])
     with monkeypatch.context() as patch:
         patch.setattr(
             building,
             "layers_seen",
-            lambda frame, street: seen(frame, street._replace(route=None, camera_height_m=2.0)),
+            lambda frame, street: seen(frame, street._replace(route=aside)),
         )
         interrupt_second(out, 6, patch)
     stray = out.with_name(out.name + WORK) / store.part_path(TinyClip().keys[0], "classes")

@@ -25,12 +25,15 @@ def background_of(
     weather: Weather,
     ambience: Ambience,
     window: Window,
-    layers: Layers,
+    layers: Layers | None,
     options: RenderOptions,
 ) -> Surface:
-    """The frame's surface with the weather's background in a window."""
+    """The frame's surface with the weather's background in a window.
+
+    Without layers it is the recorded one: those who need none do not have to look at the frame.
+    """
     surface = surface_of(frame)
-    if not changes_background(weather, options.without):
+    if layers is None or not changes_background(weather, options.without):
         return surface
     image = edited(frame, layers, weather, ambience, window, options.without)
     return repainted(surface, image, window)

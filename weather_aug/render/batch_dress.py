@@ -19,7 +19,7 @@ from weather_aug._compiled import compiled
 from weather_aug.clip.types import Camera
 from weather_aug.edit.ambience import Ambience
 from weather_aug.edit.physical.dress import MAPS, OBJECT_GAINS
-from weather_aug.edit.physical.edit import _shared, _tone_tables, geometry_of
+from weather_aug.edit.physical.edit import _shared, geometry_of, tone_tables
 from weather_aug.edit.physical.layer_rows import load_row
 from weather_aug.edit.physical.layers import GROUND_GAIN, MATTE, OBJECT_GAIN, Layers
 from weather_aug.edit.physical.look import look_of
@@ -90,7 +90,7 @@ class Dressing:
     ) -> Dressing:
         """What `edit.physical.edit.edited` gives to its kernels, in the depth's dtype."""
         look = look_of(weather, ambience, layers.illumination, time_s, without)
-        curve, by_root, matrix = _tone_tables(0.0 if "relight" in without else weather.overcast)
+        curve, by_root, matrix = tone_tables(0.0 if "relight" in without else weather.overcast)
         maps = np.zeros((MAPS, *layers.maps.shape[1:]), np.float32)
         _under_tone(_shared(layers.maps.view(np.uint16)), by_root, matrix, look, maps)
         classes = torch.tensor(np.asarray(layers.classes), device=depth_m.device)

@@ -96,9 +96,9 @@ def dressed_ground(
             shown = rippled(shown, pool, places.size_m, pixels, geometry, look)
         light = _mirrored(light, shown, pool, shine, places.sine, look.flooded)
     if max(look.road_snow, look.snow) > 0:
-        left = amount * (1.0 - (1.0 - TRACK_COVER) * tracks)
+        left = 1.0 - (1.0 - TRACK_COVER) * tracks
         softness = torch.where(road, TRACK_SOFTNESS, 0.0).to(lit.dtype)
-        cover = covered(left, _fuzz(places.size_m) + softness, pixels.noise)
+        cover = left * covered(amount, _fuzz(places.size_m) + softness, pixels.noise)
         least = torch.where(road, SLUSH, CLEAN).to(lit.dtype)
         under = (luminance(light) / (ASPHALT_ALBEDO * look.exposure * lit)).clamp(max=2.0)
         shade = (least + (LIGHTEST - least) * pixels.noise) * (

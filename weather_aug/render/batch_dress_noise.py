@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from weather_aug.edit.physical.noise import (
-    _TURN,
     CELL_M,
     COARSE_SHARE,
     COARSER,
     LEVELS,
     TILE_CELLS,
+    TURN,
     noise_tile,
 )
 from weather_aug.edit.physical.noise_rows import FARTHEST_M, FLATTEST_SINE, KNOT_PX, OBLIQUE
@@ -83,7 +83,7 @@ def ground_noise(along_m: Tensor, left_m: Tensor, footprint_m: Tensor, offset_m:
     limits = torch.arange(LEVELS - 1, device=along_m.device).to(along_m.dtype)
     level = torch.bucketize(footprint_m * per_m, 1.5 * torch.exp2(limits), out_int32=True)
     fine = _looked_up(tile, (along_m + offset_m) * per_m, (left_m - offset_m) * per_m, level)
-    cosine, sine = _TURN
+    cosine, sine = TURN
     u, v = cosine * along_m + sine * left_m, cosine * left_m - sine * along_m
     slow, aside = per_m / COARSER, offset_m * per_m
     coarse_level = (level - COARSER_LEVELS).clamp(min=0)

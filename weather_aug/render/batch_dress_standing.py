@@ -12,7 +12,12 @@ from torch import Tensor
 
 from weather_aug.edit.physical.layers import ILLUMINATION
 from weather_aug.edit.physical.materials import BURIED, CAP_M, COVER, LEAF, LEVEL, POROSITY
-from weather_aug.edit.physical.standing_rows import BURIED_RANGE_M, GRAIN_NOISE, NO_CAP_M
+from weather_aug.edit.physical.standing_rows import (
+    BURIED_RANGE_M,
+    GRAIN_NOISE,
+    LEAF_SOFTNESS,
+    NO_CAP_M,
+)
 from weather_aug.render.batch_dress_grid import Grid, Pixels
 from weather_aug.render.batch_dress_ground import covered, film, laid, luminance, ramp, snow_light
 
@@ -107,7 +112,7 @@ def snowed_standing(
 def _on_leaves(brightness: Tensor, amount: Tensor, noise: Tensor) -> Tensor:
     """Cover of a crown, the bright parts first; `brightness` is over the mean around it."""
     detail = (0.5 + 0.7 * (brightness - 1.0)).clamp(0.0, 1.0)
-    return covered(0.8 * amount, 0.2, detail + GRAIN_NOISE * (noise - detail))
+    return covered(0.8 * amount, LEAF_SOFTNESS, detail + GRAIN_NOISE * (noise - detail))
 
 
 def _on_edges(

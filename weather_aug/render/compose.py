@@ -14,6 +14,7 @@ from weather_aug.air import Air, air_of
 from weather_aug.clip.types import Box, Camera, Frame, FrameKey, Window
 from weather_aug.edit.ambience import Ambience
 from weather_aug.edit.physical.layers import Layers
+from weather_aug.edit.physical.look import changes_background
 from weather_aug.edit.surface import checked_window, depth_of, surface_of
 from weather_aug.errors import ArgumentError
 from weather_aug.particles.shelter import Shelter
@@ -34,7 +35,7 @@ from weather_aug.render.lens_wiper import CROSSING, wiper_of
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.render.scattering import scattering_margin_px
 from weather_aug.render.stage import Planes, Stage
-from weather_aug.render.taken import camera_in, taken, window_taken
+from weather_aug.render.taken import camera_in, sees_whole, taken, window_taken
 from weather_aug.render.traffic import traffic_of
 from weather_aug.taxonomy import IGNORE, SIDEWALK, SKY, TRAIN_ID
 from weather_aug.weather import Weather
@@ -138,7 +139,8 @@ def render(
     if air is None:
         air = air_of(weather, frame.time_s, seed)
     outer = _with_margin(window, _margin_px(frame, options), height, width)
-    if layers is None:
+    edits = changes_background(weather, options.without)
+    if layers is None and (edits or sees_whole(weather, options)):
         layers = looked_at(frame, ambience)
     if options.preset != "physical":
         surface = background_of(frame, weather, ambience, outer, layers, options)

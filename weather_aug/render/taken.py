@@ -49,12 +49,22 @@ def window_taken(window: Window, camera: Camera, options: RenderOptions) -> Wind
     return block_window(window, camera) if options.has("compression") else window
 
 
+def sees_whole(weather: Weather, options: RenderOptions) -> bool:
+    """Whether glass or lens bring light from elsewhere in the picture."""
+    return _is_wet(weather, options) or (options.has("glare") and glare_share(weather) > 0)
+
+
+def _is_wet(weather: Weather, options: RenderOptions) -> bool:
+    drawn = any(options.has(name) for name in LENS_EFFECTS)
+    return drawn and (weather.lens_drops > 0 or weather.wipers > 0)
+
+
 def taken(
     image: UInt8,
     frame: Frame,
     stage: Stage,
     fields: Sequence[ParticleField],
-    layers: Layers,
+    layers: Layers | None,
 ) -> Taken:
     """What the glass, the lens and the sensor make of a window.
 
@@ -63,16 +73,16 @@ def taken(
         frame: The recorded frame.
         stage: That rendered the window.
         fields: Particles of the weather.
-        layers: Of the frame.
+        layers: Of the frame; may be None unless `sees_whole`.
     """
     weather, options = stage.weather, stage.options
     lens = [options.has(name) for name in LENS_EFFECTS]
     sensor = [options.has(name) for name in SENSOR_EFFECTS]
-    wet = any(lens) and (weather.lens_drops > 0 or weather.wipers > 0)
-    glare = options.has("glare") and glare_share(weather) > 0
-    whole = _whole(frame, stage, fields, layers) if wet or glare else None
+    whole = None
+    if layers is not None and sees_whole(weather, options):
+        whole = _whole(frame, stage, fields, layers)
     glass = None
-    if wet and whole is not None:
+    if whole is not None and _is_wet(weather, options):
         glass = through_glass(
             image,
             whole,

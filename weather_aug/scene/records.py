@@ -109,16 +109,16 @@ def streets(
         axes_world: (3, 3) of the street.
         is_drive: False for unrelated pictures; none of them tells where another was driven.
     """
-    places: dict[str, list[NDArray[np.float64]]] = {}
-    for record in sorted(frames, key=lambda record: record.key.time_index):
+    # One way for the rig: wheels leave the same tracks in all of its cameras.
+    places: dict[int, list[NDArray[np.float64]]] = {}
+    for record in frames:
         place = (axes_world @ record.camera.centre_world)[:2]
-        places.setdefault(record.key.camera, []).append(place)
-    return {
-        camera: Street(
-            axes_world, height_m, route_of(np.array(places[camera])) if is_drive else None
-        )
-        for camera, height_m in _heights_m(frames).items()
-    }
+        places.setdefault(record.key.time_index, []).append(place)
+    route = None
+    if is_drive:
+        route = route_of(np.array([np.mean(places[time], axis=0) for time in sorted(places)]))
+    heights_m = _heights_m(frames)
+    return {camera: Street(axes_world, height_m, route) for camera, height_m in heights_m.items()}
 
 
 def check_name(what: str, name: Any) -> str:

@@ -66,7 +66,7 @@ def edited(
         geometry_of(frame.camera, ambience.axes_world, layers.plane, labelled=labelled),
         look,
         _shared(layers.tint),
-        _tone_tables(0.0 if "relight" in without else weather.overcast),
+        tone_tables(0.0 if "relight" in without else weather.overcast),
         material_table(labelled=labelled),
         _shared(layers.maps.view(np.uint16)),
         np.float32(layers.step),
@@ -99,7 +99,7 @@ def _shared(array: NDArray[Any]) -> Any:
 
 
 @lru_cache(maxsize=64)
-def _tone_tables(overcast: float) -> tuple[Float32, Float32, Float32]:
+def tone_tables(overcast: float) -> tuple[Float32, Float32, Float32]:
     """Toned light by sRGB level (256,) and by square root of light (N,), and the matrix."""
     curve, matrix = tone(overcast)
     light = np.linspace(0.0, MOST_ROOT, MOST_ROOT * TABLE_STEPS + 1) ** 2

@@ -208,8 +208,8 @@ def _mirror(x0, x1, flooded_share, b):
 def _cover(x0, x1, amount, softness, b):
     one = np.float32(1.0)
     for x in range(x0, x1):
-        left = amount * (one - np.float32(1.0 - TRACK_COVER) * b[SIDE, x])
-        b[COVERED, x] = covered(left, _fuzz(b[SIZE, x]) + softness, b[NOISE, x])
+        left = one - np.float32(1.0 - TRACK_COVER) * b[SIDE, x]
+        b[COVERED, x] = left * covered(amount, _fuzz(b[SIZE, x]) + softness, b[NOISE, x])
 
 
 @compiled

@@ -26,10 +26,10 @@ LEVELS = 8
 COARSER = 16.0
 COARSE_SHARE = 0.62
 """Of the sum of both looks."""
-_TURN = (0.8, 0.6)
+TURN = (0.8, 0.6)
 """Cosine and sine of the angle between the looks."""
 PERIOD_M = 5 * TILE_CELLS * CELL_M * COARSER
-"""Along and left: a multiple of both looks' periods, turned by `_TURN` or not."""
+"""Along and left: a multiple of both looks' periods, turned by `TURN` or not."""
 _COARSEST_LATTICE, _OCTAVES, _GAIN = 8, 6, 0.62
 
 
@@ -121,8 +121,8 @@ def ground_noise(tile, along, left, footprint_m, offset):
     fine = looked_up(tile, (along + offset) * per_m, (left - offset) * per_m, level)
     coarse_level = level - np.int32(4)
     coarse_level = coarse_level if coarse_level > np.int32(0) else np.int32(0)
-    turned_u = np.float32(_TURN[0]) * along + np.float32(_TURN[1]) * left
-    turned_v = np.float32(_TURN[0]) * left - np.float32(_TURN[1]) * along
+    turned_u = np.float32(TURN[0]) * along + np.float32(TURN[1]) * left
+    turned_v = np.float32(TURN[0]) * left - np.float32(TURN[1]) * along
     slow = per_m * np.float32(1.0 / COARSER)
     aside = offset * per_m
     coarse = looked_up(tile, turned_u * slow - aside, turned_v * slow + aside, coarse_level)

@@ -10,7 +10,8 @@ from weather_aug.colour import LUMINANCE, SRGB_LEVELS_LINEAR
 Float64 = NDArray[np.float64]
 
 MIDDLE_GREY = 0.18
-CONTRAST_LOSS = 0.25
+CONTRAST_LOSS = 0.18
+SATURATION_LOSS = 0.28
 ZENITH_GAIN = 0.6
 """An overcast sky is 1 + this times as bright overhead as at the horizon, where it has the
 airlight's colour; less than the CIE's 3, because the camera exposes for the street and clips."""
@@ -21,7 +22,7 @@ MEAN_SKY_GAIN = 1.0 + 0.5 * ZENITH_GAIN
 def tone(overcast: float) -> tuple[Float64, Float64]:
     """How an overcast sky changes recorded colours.
 
-    Contrast falls by a quarter about middle grey, saturation by a third, the white turns from
+    Contrast falls by a sixth about middle grey, saturation by a quarter, the white turns from
     6500 K to about 7200 K; the auto-exposure hides most of the lost light.
 
     Args:
@@ -35,7 +36,7 @@ def tone(overcast: float) -> tuple[Float64, Float64]:
     contrast = 1.0 - CONTRAST_LOSS * overcast
     gain = 1.0 - 0.15 * overcast * (1.0 - 0.8)
     curve = gain * MIDDLE_GREY * (light / MIDDLE_GREY) ** contrast if overcast else light
-    saturation = 1.0 - 0.35 * overcast
+    saturation = 1.0 - SATURATION_LOSS * overcast
     grey = np.broadcast_to(LUMINANCE, (3, 3))
     white = 1.0 + overcast * (np.array([0.96, 1.00, 1.05]) - 1.0)
     matrix = white[:, None] * (saturation * np.eye(3) + (1.0 - saturation) * grey)

@@ -35,6 +35,8 @@ from weather_aug.edit.physical.spread import spread_run
 NO_CAP_M = 99.0
 BURIED_RANGE_M = 30.0
 """Farther off, the road's plane is not known to centimetres."""
+LEAF_SOFTNESS = 0.5
+"""Of where leaves turn white: single leaves are smaller than a pixel, and must not flicker."""
 GRAIN_NOISE = 0.25
 """Share of the noise in where leaves are white; the rest is the picture's own light and dark."""
 
@@ -137,4 +139,4 @@ def _leaves(x0, x1, amount, exposure, b):
         detail = half + np.float32(0.7) * (luminance(b[R, x], b[G, x], b[B, x]) / mean - one)
         detail = min(max(detail, zero), one)
         grain = detail + np.float32(GRAIN_NOISE) * (b[NOISE, x] - detail)
-        b[COVERED, x] = covered(np.float32(0.8) * amount, np.float32(0.2), grain)
+        b[COVERED, x] = covered(np.float32(0.8) * amount, np.float32(LEAF_SOFTNESS), grain)

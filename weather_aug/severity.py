@@ -58,7 +58,7 @@ RAIN = {
     "rain_mm_per_h": Stops((1.5, 5.0, 20.0, 75.0)),
     "mist_per_km": Stops((0.2, 0.6, 2.0, 5.0)),
     "spray_per_km": Stops((0.5, 2.0, 10.0, 25.0)),
-    "overcast": Stops((0.4, 0.8, 1.0, 1.0)),
+    "overcast": Stops((0.35, 0.8, 1.0, 1.0)),
     "gustiness": Stops((0.3, 0.3, 0.3, 0.3)),
     "wetness": Stops((0.5, 0.8, 1.0, 1.0)),
     "puddles": Stops((0.02, 0.06, 0.15, 0.30)),
@@ -70,11 +70,11 @@ RAIN_WIND_M_PER_S = Stops((1.5, 3.0, 6.0, 10.0))
 SNOW = {
     "snow_mm_per_h": Stops((0.4, 1.0, 2.0, 4.0)),
     "mist_per_km": Stops((0.3, 0.8, 2.0, 5.0)),
-    "overcast": Stops((0.4, 0.8, 1.0, 1.0)),
+    "overcast": Stops((0.35, 0.8, 1.0, 1.0)),
     "gustiness": Stops((0.25, 0.25, 0.25, 0.25)),
     "wetness": Stops((0.4, 0.6, 0.7, 0.7)),
-    "snow_cover": Stops((0.15, 0.6, 0.9, 1.0)),
-    "road_snow_cover": Stops((0.03, 0.2, 0.5, 0.9)),
+    "snow_cover": Stops((0.1, 0.6, 0.9, 1.0)),
+    "road_snow_cover": Stops((0.02, 0.2, 0.5, 0.9)),
     "snow_depth_m": Stops((0.01, 0.03, 0.08, 0.20)),
     "lamps": Stops((0.3, 0.7, 1.0, 1.0)),
     "lens_drops": Stops((1.0, 2.0, 5.0, 10.0)),
@@ -82,7 +82,7 @@ SNOW = {
 }
 SNOW_WIND_M_PER_S = Stops((0.5, 1.0, 2.0, 4.0))
 FOG = {
-    "overcast": Stops((0.4, 0.8, 1.0, 1.0)),
+    "overcast": Stops((0.35, 0.8, 1.0, 1.0)),
     "wetness": Stops((0.1, 0.2, 0.3, 0.4)),
     "lamps": Stops((0.5, 0.8, 1.0, 1.0)),
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -214,3 +215,22 @@ def test_either_a_severity_or_a_unit() -> None:
     for arguments in ({}, {"severity": 0.5, "mm_per_h": 3}):
         with pytest.raises(ArgumentError, match="either a severity or mm_per_h"):
             Weather.rain(**arguments)
+
+
+README_ROWS = {
+    "rain, mm/h": [("rain", "rain_mm_per_h")],
+    "snow, mm/h of water": [("snow", "snow_mm_per_h")],
+    "wetness of the road in rain": [("rain", "wetness")],
+    "snow cover beside the road · on it": [("snow", "snow_cover"), ("snow", "road_snow_cover")],
+    "drops on the glass in rain": [("rain", "lens_drops")],
+}
+
+
+@pytest.mark.parametrize("row", README_ROWS)
+def test_the_readme_says_what_the_stops_are(row: str) -> None:
+    text = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    (line,) = [line for line in text.splitlines() if line.startswith(f"| {row} |")]
+    cells = [[float(value) for value in cell.split("·")] for cell in line.split("|")[2:-1]]
+    for column, (kind, name) in enumerate(README_ROWS[row]):
+        table = {"rain": stops.RAIN, "snow": stops.SNOW}[kind]
+        assert tuple(cell[column] for cell in cells) == table[name].values

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,3 +30,9 @@ def srgb_from_linear(value: Float64) -> Float64:
 
 SRGB_LEVELS_LINEAR = linear_from_srgb(np.arange(256) / 255.0)
 """(256,) linear light of each 8-bit sRGB level."""
+
+
+@lru_cache(maxsize=1)
+def srgb_of_16_bits() -> NDArray[np.uint8]:
+    """(65536,) sRGB level of linear light, 65535 for white."""
+    return np.round(255.0 * srgb_from_linear(np.arange(65536) / 65535.0)).astype(np.uint8)

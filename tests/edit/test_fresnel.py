@@ -9,7 +9,7 @@ from weather_aug.edit.physical.fresnel import (
     WATER_INDEX,
     film_ratio,
     fresnel,
-    fresnel_row,
+    fresnel_of_sine,
 )
 from weather_aug.errors import ArgumentError
 
@@ -54,8 +54,7 @@ def test_it_is_snells_law(grazing_rad):
 
 
 def test_rows_are_the_exact_values():
-    out = np.empty_like(SINES)
-    fresnel_row(SINES, out)
+    out = np.array([fresnel_of_sine(sine) for sine in SINES])
     np.testing.assert_allclose(fresnel(np.arcsin(SINES.astype(np.float64))), out, atol=2e-6)
     assert np.abs(schlick(np.arcsin(SINES)) - out).max() > 0.03
 

@@ -12,7 +12,7 @@ from weather_aug.clip.types import FrameKey
 from weather_aug.errors import ArgumentError
 from weather_aug.render import sensor
 from weather_aug.render.sensor import (
-    COMPRESSION_MARGIN_PX,
+    COMPRESSION_BLOCK_PX,
     block_window,
     daylight_share,
     exposed,
@@ -310,7 +310,7 @@ def test_a_window_has_the_blocks_of_the_whole(picture, whole, window):
     np.testing.assert_array_equal(part(expected, window), compressed_window(picture, whole, window))
     before = (window[0] - outer[0], window[1] - outer[1])
     after = (outer[2] - window[2] - before[0], outer[3] - window[3] - before[1])
-    assert 0 <= min(*before, *after) <= max(*before, *after) <= COMPRESSION_MARGIN_PX
+    assert 0 <= min(*before, *after) <= max(*before, *after) < COMPRESSION_BLOCK_PX
     assert block_window(outer, CAMERA) == outer
 
 

@@ -158,7 +158,14 @@ def light_row(surface, y, left, linear, red, green, blue):
 
 def _flat(array: NDArray[Any], channels: int = 0) -> Any:
     """A read-only (N,) or (N, channels) view of `array`, of a copy if it is not contiguous."""
-    shape = (-1, channels) if channels else (-1,)
-    flat = np.ascontiguousarray(array).reshape(shape).view(np.ndarray)
-    flat.flags.writeable = False
-    return flat
+    return shared(array).reshape((-1, channels) if channels else (-1,))
+
+
+def shared(array: NDArray[Any]) -> Any:
+    """A contiguous view that nobody can write, of a plain array, of a copy if it is none.
+
+    Kernels are compiled once for what may be written and once for what may not, so they get these.
+    """
+    view = np.ascontiguousarray(array).view(np.ndarray)[...]
+    view.flags.writeable = False
+    return view

@@ -19,13 +19,14 @@ from weather_aug._compiled import compiled
 from weather_aug.clip.types import Camera
 from weather_aug.edit.ambience import Ambience
 from weather_aug.edit.physical.dress import MAPS, OBJECT_GAINS
-from weather_aug.edit.physical.edit import _shared, geometry_of, tone_tables
+from weather_aug.edit.physical.edit import geometry_of, tone_tables
 from weather_aug.edit.physical.layer_rows import load_row
 from weather_aug.edit.physical.layers import GROUND_GAIN, MATTE, OBJECT_GAIN, Layers
 from weather_aug.edit.physical.look import look_of
 from weather_aug.edit.physical.materials import GROUND, POROSITY, material_table
 from weather_aug.edit.physical.noise_rows import OTHER_M
 from weather_aug.edit.physical.relight import SKY_FEATURE
+from weather_aug.edit.surface import shared
 from weather_aug.render.batch_dress_grid import Grid, Pixels, plain
 from weather_aug.render.batch_dress_ground import dressed_ground, luminance
 from weather_aug.render.batch_dress_noise import noise_of_rows
@@ -92,7 +93,7 @@ class Dressing:
         look = look_of(weather, ambience, layers.illumination, time_s, without)
         curve, by_root, matrix = tone_tables(0.0 if "relight" in without else weather.overcast)
         maps = np.zeros((MAPS, *layers.maps.shape[1:]), np.float32)
-        _under_tone(_shared(layers.maps.view(np.uint16)), by_root, matrix, look, maps)
+        _under_tone(shared(layers.maps.view(np.uint16)), by_root, matrix, look, maps)
         classes = torch.tensor(np.asarray(layers.classes), device=depth_m.device)
         geometry = geometry_of(camera, ambience.axes_world, layers.plane, labelled=labelled)
         tops = below_top_m(classes, depth_m, float(geometry.fy)) if look.snow > 0 else None

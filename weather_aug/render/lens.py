@@ -6,7 +6,6 @@ The glass is 0.3 m away and the camera looks at the street, so everything on it 
 from __future__ import annotations
 
 import hashlib
-from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from weather_aug._checks import finite, image_uint8
 from weather_aug._keys import check_seed
 from weather_aug.clip.types import Camera, Window
-from weather_aug.colour import SRGB_LEVELS_LINEAR, srgb_from_linear
+from weather_aug.colour import SRGB_LEVELS_LINEAR, srgb_from_linear, srgb_of_16_bits
 from weather_aug.errors import ArgumentError
 from weather_aug.render.lens_drops import drops_on
 from weather_aug.render.lens_refraction import draw_drops, fill_pyramid
@@ -218,11 +217,9 @@ def _veiled(image: UInt8, light: Float64) -> UInt8:
     return cv2.LUT(image, levels.reshape(256, 1, 3))
 
 
-@lru_cache(maxsize=1)
 def _curves() -> tuple[Float32, UInt8]:
     """Linear light (256,) of sRGB levels, and sRGB levels of linear light (65536,)."""
-    srgb = np.round(255.0 * srgb_from_linear(np.arange(65536) / 65535.0)).astype(np.uint8)
-    return SRGB_LEVELS_LINEAR.astype(np.float32), srgb
+    return SRGB_LEVELS_LINEAR.astype(np.float32), srgb_of_16_bits()
 
 
 def _number_of(glass: str) -> int:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from weather_aug._checks import finite, image_uint8, like_image
 from weather_aug._compiled import compiled
-from weather_aug.colour import SRGB_LEVELS_LINEAR, srgb_from_linear
+from weather_aug.colour import SRGB_LEVELS_LINEAR, srgb_of_16_bits
 from weather_aug.errors import ArgumentError
 
 Float32 = NDArray[np.float32]
@@ -87,7 +87,7 @@ def scattered_background(image: UInt8, optical_depth: Float32, focal_px: float) 
         np.float32(1.0 / math.sqrt(WIDEST_TAU - CLEAR_TAU)),
     )
     levels = np.array(LEVELS, np.float32)
-    _mix(tau, stack, levels, law, _srgb_of_16(), mixed)
+    _mix(tau, stack, levels, law, srgb_of_16_bits(), mixed)
     out[part] = mixed
     return out
 
@@ -147,12 +147,6 @@ def _level_above(share: float) -> int:
 def _linear_16() -> Float32:
     """(256,) linear light of each sRGB level, 65535 for white."""
     return np.round(65535.0 * SRGB_LEVELS_LINEAR).astype(np.float32)
-
-
-@lru_cache(maxsize=1)
-def _srgb_of_16() -> UInt8:
-    """(65536,) sRGB level of linear light, 65535 for white."""
-    return np.round(255.0 * srgb_from_linear(np.arange(65536) / 65535.0)).astype(np.uint8)
 
 
 @compiled

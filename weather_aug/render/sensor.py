@@ -71,8 +71,6 @@ BEST_QUALITY, LEAST_QUALITY = 95, 80
 QUALITY_PER_LEVEL = 5.0
 """What noise of one level at middle grey costs, because it takes bits."""
 COMPRESSION_BLOCK_PX = 8
-COMPRESSION_MARGIN_PX = COMPRESSION_BLOCK_PX - 1
-"""Most pixels by which `block_window` extends a window on each side."""
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug._compiled import compiled, inlined
+from weather_aug._rows import encoded
 from weather_aug.particles.kernels import GOLDEN, mix64
 
 Float32 = NDArray[np.float32]
@@ -234,29 +235,20 @@ def _veil_row(
     """Turn a row's light into levels, not rounded, with the veil over it."""
     for x in range(row.shape[0]):
         veil = upper[x] + share * (lower[x] - upper[x])
-        row[x] = encoded(kept * row[x] + veil)
+        row[x] = _level(kept * row[x] + veil)
 
 
 @inlined
-def encoded(v: np.float32) -> np.float32:
-    """SRGB level, not rounded, of linear light; the approximation of `shade.encode_row`."""
-    one = np.float32(1.0)
-    v = v if v < one else one
-    s = np.sqrt(v)
-    p = np.float32(-1.6236571) + s * np.float32(0.5173023)
-    p = np.float32(2.0315735) + s * p
-    p = np.float32(-1.4027363) + s * p
-    p = np.float32(1.5179509) + s * p
-    p = np.float32(-0.0401096) + s * p
-    p = p if v > np.float32(0.0031308) else np.float32(12.92) * v
-    return p * np.float32(255.0)
+def _level(v: np.float32) -> np.float32:
+    """SRGB level, not rounded, of linear light from 0 on; what is brighter than white is white."""
+    return encoded(v if v < np.float32(1.0) else np.float32(1.0))
 
 
 @compiled
 def levels_of(light: Float32, out: Float32) -> None:
-    """`encoded` of every value of a row."""
+    """Unrounded sRGB level of every value of a row."""
     for x in range(out.shape[0]):
-        out[x] = encoded(light[x])
+        out[x] = _level(light[x])
 
 
 @compiled

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from functools import lru_cache
-from typing import Any
 
 import cv2
 import numpy as np
@@ -20,7 +19,7 @@ from weather_aug.edit.physical.look import look_of
 from weather_aug.edit.physical.materials import material_table
 from weather_aug.edit.physical.noise import PERIOD_M, noise_tile
 from weather_aug.edit.physical.overcast import tone
-from weather_aug.edit.surface import surface_of
+from weather_aug.edit.surface import shared, surface_of
 from weather_aug.weather import Weather
 
 Float32 = NDArray[np.float32]
@@ -61,14 +60,14 @@ def edited(
     dress(
         np.stack(cv2.split(part)),
         surface_of(frame),
-        _shared(layers.classes).reshape(-1),
+        shared(layers.classes).reshape(-1),
         window,
         geometry_of(frame.camera, ambience.axes_world, layers.plane, labelled=labelled),
         look,
-        _shared(layers.tint),
+        shared(layers.tint),
         tone_tables(0.0 if "relight" in without else weather.overcast),
         material_table(labelled=labelled),
-        _shared(layers.maps.view(np.uint16)),
+        shared(layers.maps.view(np.uint16)),
         np.float32(layers.step),
         noise_tile(),
         out,
@@ -89,13 +88,6 @@ def geometry_of(camera: Camera, axes_world: Float64, plane: Float64, *, labelled
         *(*climb, *places, height_m, float(labelled)),
     )
     return Geometry(*(np.float32(value) for value in values))
-
-
-def _shared(array: NDArray[Any]) -> Any:
-    """A read-only view, so that the kernel is compiled once for what may be written or not."""
-    view = np.ascontiguousarray(array).view(np.ndarray)[...]
-    view.flags.writeable = False
-    return view
 
 
 @lru_cache(maxsize=64)

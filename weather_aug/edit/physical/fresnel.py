@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from weather_aug._compiled import compiled, inlined
+from weather_aug._compiled import inlined
 from weather_aug.errors import ArgumentError
 
 Float64 = NDArray[np.float64]
@@ -98,10 +98,3 @@ def film_ratio_of(albedo):
     """`film_ratio`, float32."""
     passes = np.float32((1.0 - DIFFUSE_FROM_AIR) * (1.0 - DIFFUSE_FROM_WATER))
     return passes / (np.float32(1.0) - np.float32(DIFFUSE_FROM_WATER) * albedo)
-
-
-@compiled
-def fresnel_row(sine, out):
-    """Write `fresnel_of_sine` of a row (n,) of sines to `out` (n,), float32."""
-    for column in range(sine.shape[0]):
-        out[column] = fresnel_of_sine(sine[column])

@@ -7,7 +7,6 @@ every weather of it is a function of them, pixel by pixel.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +18,7 @@ from weather_aug.edit.physical import relight, settling
 from weather_aug.edit.physical.mirror import mirror_map, mirrored
 from weather_aug.edit.physical.overcast import ZENITH_GAIN
 from weather_aug.edit.physical.site import Site
+from weather_aug.edit.surface import shared
 from weather_aug.taxonomy import SKY
 
 Float32 = NDArray[np.float32]
@@ -93,12 +93,12 @@ def layers_of(site: Site, path: Float64 | None = None) -> Layers:
     stack = halves(np.stack(planes))
     return Layers(
         float(site.step),
-        _shared(stack),
-        _shared(flat.tint),
-        _shared(site.plane),
-        _shared(site.classes),
+        shared(stack),
+        shared(flat.tint),
+        shared(site.plane),
+        shared(site.classes),
         float(np.median(stack[ILLUMINATION])),
-        _shared(thumbnail_of(site.frame.image)),
+        shared(thumbnail_of(site.frame.image)),
     )
 
 
@@ -112,13 +112,6 @@ def thumbnail_of(image: UInt8) -> UInt8:
     """The picture (H, W, 3) at most 256 pixels wide, by means of its pixels."""
     height, width = thumbnail_shape(*image.shape[:2])
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
-
-
-def _shared(array: NDArray[Any]) -> Any:
-    """A view that nobody can write: layers are shared, and kernels are compiled for such arrays."""
-    view = array.view()
-    view.flags.writeable = False
-    return view
 
 
 def overcast_light(site: Site, flat: relight.Flattening) -> Float32:

@@ -69,7 +69,9 @@ _SETS = {
     "sh": _Kind("<f4", 3, MOST_COLOUR),
     "class_scores": _Kind("<f2", 2, MOST_HALF),
 }
-_KINDS = {f"{which}_{name}": kind for which in ("background", "actor") for name, kind in _SETS.items()}
+_KINDS = {
+    f"{which}_{name}": kind for which in ("background", "actor") for name, kind in _SETS.items()
+}
 _SCORES = ("background_class_scores", "actor_class_scores")
 _KINDS |= {
     "owners": _Kind("<i4", 1, 2**31 - 1),
@@ -162,7 +164,9 @@ def encode_labels(reconstruction: Reconstruction) -> tuple[Entry, Parts]:
 def encode_style(name: str, style: Style) -> tuple[Entry, Parts]:
     """The colours of a weather, as `encode_geometry` gives the rest."""
     check_name("style", name)
-    entry, parts = _encoded({_style_array(name, part): getattr(style, part) for part in _STYLE_KINDS})
+    entry, parts = _encoded(
+        {_style_array(name, part): getattr(style, part) for part in _STYLE_KINDS}
+    )
     return entry | {"styles": [name]}, parts
 
 

@@ -12,12 +12,14 @@ from weather_aug.clip.types import Clip, Frame, FrameKey, Window
 from weather_aug.edit.ambience import Ambience
 from weather_aug.edit.physical.layers import Layers
 from weather_aug.errors import ArgumentError, IntegrityError, printable
+from weather_aug.gaussians.types import Reconstruction
 from weather_aug.particles.shelter import Shelter
 from weather_aug.render.compose import RenderedFrame, render
 from weather_aug.render.fields import RigMotion
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene import store
 from weather_aug.scene.layers import Street, layers_seen
+from weather_aug.scene.reconstruction import read_reconstruction
 from weather_aug.scene.records import FrameRecord, Manifest, streets
 from weather_aug.timeline import WeatherTimeline
 from weather_aug.weather import Weather
@@ -133,6 +135,16 @@ class WeatherScene:
             SceneError: If the map's file cannot be read any more.
         """
         return store.read_shelter(self.path, self.manifest)
+
+    @cached_property
+    def reconstruction(self) -> Reconstruction | None:
+        """The drive as Gaussians, memory-mapped; None if the scene was built without.
+
+        Raises:
+            SceneError: If a file of it cannot be read any more, or holds what no scene can.
+        """
+        record = self.manifest.reconstruction
+        return None if record is None else read_reconstruction(self.path, record)
 
     def layers(self, key: FrameKey) -> Layers:
         """What the editor knows of a frame: read from the scene, or found out if it is of before.

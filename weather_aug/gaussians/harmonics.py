@@ -5,7 +5,9 @@ from __future__ import annotations
 from torch import Tensor
 
 
-def colours_seen(sh: Tensor, means_m: Tensor, centre_m: Tensor, degree: int | None = None) -> Tensor:
+def colours_seen(
+    sh: Tensor, means_m: Tensor, centre_m: Tensor, degree: int | None = None
+) -> Tensor:
     """sRGB (N, 3), at least 0, of Gaussians seen from `centre_m`.
 
     Args:

@@ -42,9 +42,7 @@ Entry = dict[str, Any]
 
 def encoded(scene: Reconstruction) -> tuple[Entry, dict[str, bytes]]:
     """The whole of a reconstruction: the manifest's entry and the files."""
-    made = [encode_geometry(scene)]
-    if scene.background.class_scores.shape[1]:
-        made.append(encode_labels(scene))
+    made = [encode_geometry(scene), encode_labels(scene)]
     made += [encode_style(name, style) for name, style in scene.styles.items()]
     parts = {path: data for _, files in made for path, data in files.items()}
     return joined(entry for entry, _ in made), parts
@@ -156,7 +154,7 @@ def test_an_array_that_is_lost_is_noticed(tmp_path: Path, monkeypatch: pytest.Mo
     """The check above fails if one array is stored as another."""
     own = storing._arrays_of
     monkeypatch.setattr(
-        storing, "_arrays_of", lambda s: own(s) | {"support": np.zeros_like(s.support)}
+        storing, "_arrays_of", lambda s: own(s) | {"exposures": np.zeros((6, 3, 4))}
     )
     scene = tiny_reconstruction()
     with pytest.raises(AssertionError):
@@ -321,6 +319,7 @@ HARMFUL: dict[str, tuple[str, Callable[[NDArray[Any]], NDArray[Any]], str]] = {
     "a quaternion of no length": ("actor_quaternions", lambda a: 0 * a, "no length"),
     "fewer opacities": ("background_logit_opacities", lambda a: a[:-1], "logit_opacities"),
     "five coefficients": ("background_sh", lambda a: a[:, [0, 1, 2, 3, 0]], "coefficients"),
+    "classes of others": ("actor_class_scores", lambda a: a[:, :5], "classes"),
     "too many classes": ("actor_class_scores", lambda a: np.repeat(a, 2, axis=1), "classes"),
     "an owner who is not there": ("owners", lambda a: a + 1, "owners"),
     "a negative owner": ("owners", lambda a: a - 1, "owners"),

@@ -73,6 +73,8 @@ _KINDS = {
     f"{which}_{name}": kind for which in ("background", "actor") for name, kind in _SETS.items()
 }
 _SCORES = ("background_class_scores", "actor_class_scores")
+_OPTIONAL = (*_SCORES, "support")
+"""What is found out when the geometry is known."""
 _KINDS |= {
     "owners": _Kind("<i4", 1, 2**31 - 1),
     "offsets_m": _Kind("<f4", 3, LARGEST),
@@ -127,7 +129,9 @@ def array_path(name: str) -> str:
 
 
 def encode_geometry(reconstruction: Reconstruction) -> tuple[Entry, Parts]:
-    """All but class scores and styles: the manifest's entry, and bytes by relative path.
+    """Where Gaussians are and their own colours: the manifest's entry, and bytes by relative path.
+
+    All but class scores, support and styles.
 
     Raises:
         SceneError: If it holds what no scene can (an array that is not finite, a name that is
@@ -156,9 +160,12 @@ def encode_geometry(reconstruction: Reconstruction) -> tuple[Entry, Parts]:
 
 
 def encode_labels(reconstruction: Reconstruction) -> tuple[Entry, Parts]:
-    """The class scores, as `encode_geometry` gives the rest."""
+    """Class scores and support, as `encode_geometry` gives the rest; only those that there are."""
     scores = (reconstruction.background.class_scores, reconstruction.actor_gaussians.class_scores)
-    return _encoded(dict(zip(_SCORES, scores, strict=True)))
+    arrays: Arrays = dict(zip(_SCORES, scores, strict=True)) if scores[0].shape[1] else {}
+    if len(reconstruction.support):
+        arrays["support"] = reconstruction.support
+    return _encoded(arrays)
 
 
 def encode_style(name: str, style: Style) -> tuple[Entry, Parts]:
@@ -191,7 +198,7 @@ def parse_reconstruction(
         raise ValueError("a style stands twice")
     kinds = _kinds(styles)
     shapes = {str(name): tuple(_count(n) for n in shape) for name, shape in entry["arrays"].items()}
-    optional = set(_SCORES)
+    optional = set(_OPTIONAL)
     if not set(kinds) - optional <= set(shapes) <= set(kinds):
         odd = min((set(kinds) - optional - set(shapes)) | (set(shapes) - set(kinds)))
         raise ValueError(f"the Gaussians' array {printable(odd)} is missing, or none is so called")
@@ -260,7 +267,6 @@ def _arrays_of(scene: Reconstruction) -> Arrays:
         "offsets_m": scene.offsets_m,
         "sky_faces": scene.sky.faces,
         "sky_seen": scene.sky.seen,
-        "support": scene.support,
         "track_times_s": np.concatenate([np.zeros(0), *(actor.times_s for actor in actors)]),
         "track_poses": np.concatenate(
             [np.zeros((0, 4, 4)), *(actor.world_from_actor for actor in actors)]
@@ -339,6 +345,8 @@ def _assembled(arrays: Arrays, record: ReconstructionRecord) -> Reconstruction:
     background = _gaussians(arrays, "background")
     movers = _gaussians(arrays, "actor")
     count, moving = len(background), len(movers)
+    if background.class_scores.shape[1] != movers.class_scores.shape[1]:
+        raise ValueError("background and actors have scores of other classes")
     faces = arrays["sky_faces"]
     side = faces.shape[1]
     frames, moments = len(record.cameras), sum(actor.moments for actor in record.actors)
@@ -349,7 +357,7 @@ def _assembled(arrays: Arrays, record: ReconstructionRecord) -> Reconstruction:
             "offsets_m": (moving, arrays["offsets_m"].shape[1], 3),
             "sky_faces": (6, side, side, 3),
             "sky_seen": (6, side, side),
-            "support": (count if arrays["support"].size else 0,),
+            "support": (count,),
             "track_times_s": (moments,),
             "track_poses": (moments, 4, 4),
             "camera_intrinsics": (frames, 3, 3),
@@ -374,13 +382,13 @@ def _assembled(arrays: Arrays, record: ReconstructionRecord) -> Reconstruction:
         _cameras(arrays, record),
         dict(zip(record.exposures, arrays["exposures"], strict=True)),
         {name: _style(arrays, name, count, moving, side) for name in record.styles},
-        arrays["support"],
+        arrays.get("support", np.zeros(0, np.float32)),
     )
 
 
 def _check_shapes(arrays: Arrays, expected: dict[str, tuple[int, ...]]) -> None:
     for name, shape in expected.items():
-        if arrays[name].shape != shape:
+        if name in arrays and arrays[name].shape != shape:
             raise ValueError(f"{name} has shape {arrays[name].shape}, the others expect {shape}")
 
 

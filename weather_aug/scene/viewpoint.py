@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from weather_aug._checks import finite
 from weather_aug._keys import uniforms
 from weather_aug.clip.types import Camera
+from weather_aug.edit.ambience import CAMERA_HEIGHT_RANGE_M
 from weather_aug.errors import ArgumentError, printable
 
 Float64 = NDArray[np.float64]
@@ -162,6 +163,12 @@ def heading(world_from_camera: Float64, up: Float64) -> Float64:
     if np.linalg.norm(level) < 1e-3:
         level = top - (top @ up) * up
     return np.asarray(level / np.linalg.norm(level))
+
+
+def raised_height_m(height_m: float, by_m: float) -> float:
+    """Height over the road of a camera that was moved up, as far as the renderer knows heights."""
+    low, high = CAMERA_HEIGHT_RANGE_M
+    return min(max(height_m + by_m, low), high)
 
 
 def _turned(axis: Any, angle_deg: float) -> Float64:

@@ -167,13 +167,8 @@ class _Blend(torch.autograd.Function):
         parts = np.empty((len(tiles.order), projection.PARTS), np.float32)
         values = np.empty((len(tiles.order), channels), np.float32)
         kernels.gather(tiles.order, shapes.detach().numpy(), planes.detach().numpy(), parts, values)
-<<<<<<< HEAD
-        left = torch.empty((height, width), dtype=torch.float32)
-        blended = torch.empty((height, width, channels), dtype=torch.float32)
-=======
         left = np.empty((height, width), np.float32)
         blended = np.empty((height, width, channels), np.float32)
->>>>>>> main
         ends = np.empty(len(tiles.starts) - 1, np.int64)
 
         def share(first: int, last: int) -> None:

@@ -18,7 +18,6 @@ from weather_aug.render.compose import RenderedFrame
 from weather_aug.render.label import kept_labels
 from weather_aug.render.label_snow import buried_borders, covered_faces, snow_limits
 from weather_aug.render.options import RenderOptions
-from weather_aug.scene.policy import TYPES, weather_of
 from weather_aug.scene.viewpoint import Viewpoint, moved
 from weather_aug.taxonomy import IGNORE
 from weather_aug.weather import Weather
@@ -27,12 +26,8 @@ Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Poses = Mapping[int, ArrayLike]
 
-CARRIED = (*("relight", "sky", "film", "mirror", "puddles", "ripples", "snow_cover", "tracks"),)
-"""Effects on surfaces: a style of the Gaussians has them already."""
 PLANES = ("image", "depth", "label", "seen", "normals")
 """Of a novel frame; only the last can be done without."""
-STYLE_SEVERITY = "heavy"
-"""Of the weather that styles are fitted to; `amount` goes from none of it to all."""
 AT_ITS_TIME_S = 1e-3
 """A frame so near in time is the recorded moment."""
 
@@ -44,32 +39,6 @@ class NovelFrame(NamedTuple):
     """Its label is 255 where the drive never showed what is there."""
     seen: Mask
     """(H, W): recorded frames showed what is there."""
-
-
-def style_weather(name: str) -> Weather | None:
-    """What lies on the ground and covers the sky in a style: its weather, with nothing in the air.
-
-    None for a style whose name is no type of weather.
-    """
-    if name not in TYPES:
-        return None
-    weather = weather_of(name, STYLE_SEVERITY, falling=False)
-    air = Weather.clear()
-    in_the_air = ("visibility_m", "fog_scale_height_m", "mist_per_km", "spray_per_km", "lamps")
-    return replace(weather, **{field: getattr(air, field) for field in in_the_air})
-
-
-def lying_in(style: str | Weights | None, amount: float) -> Weather:
-    """The snow on the ground of a style, or of a mixture of styles; all else is clear."""
-    if style is None:
-        return Weather.clear()
-    weights = {style: 1.0} if isinstance(style, str) else style
-    known = [(share, style_weather(name)) for name, share in weights.items()]
-    snow = {
-        name: sum(amount * share * getattr(weather, name) for share, weather in known if weather)
-        for name in ("snow_cover", "road_snow_cover", "snow_depth_m")
-    }
-    return replace(Weather.clear(), **snow)
 
 
 def novel_camera(
@@ -184,11 +153,6 @@ def _velocity_of(actor: Actor, recorded: Frame, time_s: float) -> Float64 | None
         return None
     velocity = (places[after] - places[before]) / (times_s[after] - times_s[before])
     return velocity if np.linalg.norm(velocity) <= MAX_SPEED_M_PER_S else None
-
-
-def carried_options(options: RenderOptions) -> RenderOptions:
-    """Without what a style's colours show already: the editor would dress the street twice."""
-    return replace(options, without=(*options.without, *CARRIED))
 
 
 def honest(

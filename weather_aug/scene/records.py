@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 
 from weather_aug._checks import MAX_PIXELS
 from weather_aug.clip.types import RIGID_TOLERANCE, Camera, FrameKey
-from weather_aug.edit.ambience import CAMERA_HEIGHT_M, CAMERA_HEIGHT_RANGE_M
+from weather_aug.edit.ambience import CAMERA_HEIGHT_M, CAMERA_HEIGHT_RANGE_M, Ambience
 from weather_aug.errors import SceneError, printable
 from weather_aug.particles.shelter import CELL_M
 from weather_aug.scene.layers import PARTS as LAYER_PARTS
 from weather_aug.scene.layers import LayersRecord, Street, parse_layers
 from weather_aug.scene.route import route_of
+from weather_aug.scene.viewpoint import raised_height_m
 
 if TYPE_CHECKING:
-    from weather_aug.scene.reconstruction import ReconstructionRecord
+    from weather_aug.scene.reconstruction_record import ReconstructionRecord
 
 FRAMES = "frames"
 SHELTER = "shelter.npy"
@@ -95,6 +96,14 @@ class Manifest:
     def camera_height_m(self, camera: str) -> float:
         """Height of a camera over the road, metres: the median of its frames."""
         return self._height_by_camera_m[camera]
+
+    def ambience(self, record: FrameRecord, raised_m: float = 0.0) -> Ambience:
+        """Light around a frame whose camera stands `raised_m` higher than it was recorded."""
+        light = dict(record.light)
+        if self.airlight is not None:
+            light["airlight"] = self.airlight
+        height_m = raised_height_m(self.camera_height_m(record.key.camera), raised_m)
+        return Ambience(self.axes_world, **light, camera_height_m=height_m)
 
 
 def _heights_m(frames: Iterable[FrameRecord]) -> dict[str, float]:

@@ -22,12 +22,14 @@ from weather_aug.scene import store
 from weather_aug.scene.layers import Street, layers_seen
 from weather_aug.scene.reconstruction import read_reconstruction
 from weather_aug.scene.records import FrameRecord, Manifest, streets
+from weather_aug.scene.styles import carried_options, lying_in
 from weather_aug.scene.viewpoint import Viewpoint, raised_height_m
 from weather_aug.timeline import WeatherTimeline
 from weather_aug.weather import Weather
 
 if TYPE_CHECKING:
     from weather_aug.air import Air
+    from weather_aug.gaussians.fit import FitOptions
     from weather_aug.gaussians.gather import Weights
     from weather_aug.scene.novel import NovelFrame, Poses
 
@@ -77,11 +79,44 @@ class WeatherScene:
         weathers: Sequence[str] = ("rain", "snow", "fog"),
         progress: bool = False,
         overwrite: bool = False,
+        reconstruct: bool = False,
+        reconstruction: FitOptions | None = None,
+        styles: Sequence[str] = ("rain", "snow", "fog"),
     ) -> WeatherScene:
-        """Precompute `clip` into the folder `out`; see `weather_aug.scene.build.build`."""
+        """Precompute `clip` into the folder `out`; see `weather_aug.scene.build.build`.
+
+        Args:
+            clip: The drive; every frame needs depth.
+            out: Folder to make.
+            editor: How backgrounds get their weather.
+            weathers: Types the scene is meant for.
+            progress: Show bars.
+            overwrite: Replace `out` if it is a scene already.
+            reconstruct: Turn the frames into Gaussians as well, so that they can be rendered from
+                elsewhere; takes minutes. Interrupted work goes on from its last checkpoint.
+            reconstruction: How; the default options if None.
+            styles: Weathers whose colours the Gaussians learn, as the editor shows them at the
+                heavy stop with nothing in the air.
+
+        Raises:
+            ArgumentError: If options of a reconstruction are given without `reconstruct`, or as
+                `build` and `scene.reconstruct.wanted_of` say.
+        """
         from weather_aug.scene.build import build
 
-        build(clip, Path(out), editor, weathers, progress=progress, overwrite=overwrite)
+        if reconstruction is not None and not reconstruct:
+            raise ArgumentError("reconstruction means nothing without reconstruct=True")
+        wanted = None
+        if reconstruct:
+            from weather_aug.scene.reconstruct import wanted_of
+
+            wanted = wanted_of(reconstruction, styles)
+        build(
+            *(clip, Path(out), editor, weathers),
+            progress=progress,
+            overwrite=overwrite,
+            wanted=wanted,
+        )
         return cls.load(out)
 
     @cached_property
@@ -124,15 +159,7 @@ class WeatherScene:
         The airlight is the clip's too if it is a drive: fog does not flicker. Of unrelated pictures
         each has its own.
         """
-        return self._ambience(key, 0.0)
-
-    def _ambience(self, key: FrameKey, raised_m: float) -> Ambience:
-        key = FrameKey(*key)
-        light = dict(self._record(key).light)
-        if self.manifest.airlight is not None:
-            light["airlight"] = self.manifest.airlight
-        height_m = raised_height_m(self.manifest.camera_height_m(key.camera), raised_m)
-        return Ambience(self.manifest.axes_world, **light, camera_height_m=height_m)
+        return self.manifest.ambience(self._record(key))
 
     @cached_property
     def shelter(self) -> Shelter | None:
@@ -204,7 +231,7 @@ class WeatherScene:
         never recorded, drawn from the scene's Gaussians (see `frame_from`): what no recorded frame
         showed has the label 255, and is invalid. There are two ways to its background. Without a
         style the editor dresses the picture, as it does recorded ones. A style shows its weather
-        already: the effects on surfaces (`scene.novel.CARRIED`) are left out, whatever the weather
+        already: the effects on surfaces (`scene.styles.CARRIED`) are left out, whatever the weather
         says of the ground; air, particles, light on them, spray, lamps, glass and sensor follow the
         weather, and labels are buried under the style's snow.
 
@@ -232,7 +259,7 @@ class WeatherScene:
             look = self._layers_of
             return self._rendered(self.frame(key), look, weather, seed, window, air, options)
         # Loads torch.
-        from weather_aug.scene.novel import carried_options, honest, lying_in
+        from weather_aug.scene.novel import honest
 
         novel = self.frame_from(
             key,
@@ -269,7 +296,7 @@ class WeatherScene:
             frame,
             weather,
             seed=seed,
-            ambience=self._ambience(frame.key, self._raised_m(frame)),
+            ambience=self.manifest.ambience(self._record(frame.key), self._raised_m(frame)),
             window=window,
             air=air,
             shelter=self.shelter,

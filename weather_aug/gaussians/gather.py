@@ -11,11 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from weather_aug._checks import finite
+from weather_aug.clip.types import Camera, Frame
 from weather_aug.errors import ArgumentError, printable
 from weather_aug.gaussians.actors import offset_basis, pose_at
 from weather_aug.gaussians.harmonics import colours_seen
+from weather_aug.gaussians.rasterise import Drawn, rasterise
 from weather_aug.gaussians.rotations import quaternions_of
-from weather_aug.gaussians.types import Float32, Reconstruction, Sky, Style
+from weather_aug.gaussians.types import Float32, Pinhole, Reconstruction, Sky, Style
 
 Float64 = NDArray[np.float64]
 Weights = Mapping[str, float]
@@ -144,6 +146,31 @@ def gather(
         actors=tuple(actors),
         origin_m=origin,
     )
+
+
+def rasterised(gathered: Gathered, camera: Camera, planes: Tensor, threads: int = 1) -> Drawn:
+    """Blend `planes` (R, C) in a camera's picture; gradients flow to them."""
+    rotation = camera.world_from_camera[:3, :3].T
+    camera_from_origin = np.eye(4)
+    camera_from_origin[:3, :3] = rotation
+    camera_from_origin[:3, 3] = rotation @ (gathered.origin_m - camera.centre_world)
+    return rasterise(
+        gathered.means_m,
+        gathered.quaternions,
+        gathered.scales_m,
+        gathered.opacities,
+        planes,
+        _tensor(camera_from_origin),
+        Pinhole.of(camera),
+        threads=threads,
+    )
+
+
+def camera_of(reconstruction: Reconstruction, frame: Frame) -> Camera:
+    """The refined camera of a recorded frame, at the size of its picture."""
+    camera = reconstruction.cameras.get(frame.key, frame.camera)
+    size = (frame.camera.width, frame.camera.height)
+    return camera if (camera.width, camera.height) == size else camera.resized(*size)
 
 
 def sky_of(reconstruction: Reconstruction, style: str | Weights | None, amount: float) -> Sky:

@@ -101,8 +101,8 @@ def view(
     image = depth_m = label = seen = normals = None
     if "image" in wanted:
         sky = sky_of(reconstruction, style, amount)
-        image = parts["image"] + through[..., None] * _behind(sky.faces, camera, through)
-        image = _bytes(image, exposure)
+        behind = _behind(sky.faces, camera, through)
+        image = _bytes(parts["image"] + through[..., None] * behind, exposure)
     if "depth" in wanted:
         depth_m = np.where(opacity >= SURFACE_OPACITY, drawn.depth_m.numpy(), np.float32(np.inf))
     if parts.keys() & {"label", "seen"}:

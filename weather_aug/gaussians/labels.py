@@ -17,7 +17,7 @@ from weather_aug.gaussians.gather import camera_of, gather, rasterised
 from weather_aug.gaussians.types import CLASSES, Float32, Reconstruction
 from weather_aug.taxonomy import SKY
 
-STEPS = 6
+STEPS = 4
 _LEAST = 1e-6
 
 
@@ -58,18 +58,19 @@ def fit_labels(
     """
     if steps < 1:
         raise ArgumentError(f"steps must be at least 1, got {steps}")
-    labelled = [frame for frame in frames if frame.label is not None]
+    labelled = [(frame, frame.label) for frame in frames if frame.label is not None]
     if not labelled:
         raise ArgumentError("no frame has a label; give frames of a labelled clip")
-    ids = _ids_in(labelled)
+    ids = _ids_in([label for _, label in labelled])
     count = len(reconstruction.background) + len(reconstruction.actor_gaussians)
     scores = torch.full((count, len(ids)), 1 / len(ids))
     bar = tqdm(total=steps * len(labelled), desc="labels", unit="frame", disable=not progress)
     with bar:
         for _ in range(steps):
             received = torch.zeros_like(scores)
-            for frame in labelled:
-                _hand_out(reconstruction, frame, ids, scores, received, threads)
+            for frame, label in labelled:
+                rows, given = _handed_out(reconstruction, frame, label, ids, scores, threads)
+                received[rows] += given
                 bar.update()
             total = received.sum(dim=1, keepdim=True)
             scores = torch.where(total > _LEAST, received / total.clamp_min(_LEAST), scores)
@@ -103,34 +104,34 @@ def recorded_support(
     return support[:background].numpy()
 
 
-def _ids_in(frames: Sequence[Frame]) -> NDArray[np.intp]:
+def _ids_in(labels: Sequence[NDArray[np.uint8]]) -> NDArray[np.intp]:
     """Train ids that the labels hold, rising, the sky's among them."""
     present = np.zeros(256, bool)
-    for frame in frames:
-        present[np.unique(frame.label)] = True
+    for label in labels:
+        present[np.unique(label)] = True
     present[SKY] = True
     return np.flatnonzero(present[:CLASSES])
 
 
-def _hand_out(
+def _handed_out(
     reconstruction: Reconstruction,
     frame: Frame,
+    label: NDArray[np.uint8],
     ids: NDArray[np.intp],
     scores: Tensor,
-    received: Tensor,
     threads: int,
-) -> None:
-    """Add to `received` what each Gaussian gets of the frame's labelled pixels."""
+) -> tuple[Tensor, Tensor]:
+    """Rows of the Gaussians in a frame, and what each gets of the labelled pixels by class."""
     gathered = gather(reconstruction, frame.time_s, labels=False)
     own = scores[gathered.rows].requires_grad_()
     drawn = rasterised(gathered, camera_of(reconstruction, frame), own, threads)
     likelihood = drawn.colours.detach().clone()
-    likelihood[..., np.searchsorted(ids, SKY)] += 1 - drawn.opacity
+    likelihood[..., np.searchsorted(ids, SKY)] += 1 - drawn.opacity.detach()
     place = np.full(256, -1)
     place[ids] = np.arange(len(ids))
-    target = torch.from_numpy(place[frame.label])[..., None]
-    given = torch.zeros_like(likelihood)
+    target = torch.from_numpy(place[label])[..., None]
     inverse = 1 / likelihood.gather(2, target.clamp_min(0)).clamp_min(_LEAST)
-    given.scatter_(2, target.clamp_min(0), torch.where(target >= 0, inverse, 0.0))
-    (per_score,) = torch.autograd.grad(drawn.colours, own, given)
-    received[gathered.rows] += own.detach() * per_score
+    shares = torch.zeros_like(likelihood)
+    shares.scatter_(2, target.clamp_min(0), torch.where(target >= 0, inverse, 0.0))
+    (per_score,) = torch.autograd.grad(drawn.colours, own, shares)
+    return gathered.rows, own.detach() * per_score

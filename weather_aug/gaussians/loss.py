@@ -66,8 +66,6 @@ def photometric(
     """
     if not 0 <= weight_dssim <= 1:
         raise ArgumentError(f"weight_dssim must be in 0..1, got {weight_dssim!r}")
-    if weight_dssim == 0 and counted is None:
-        return (image - (target.image if isinstance(target, SsimTarget) else target)).abs().mean()
     return weight_dssim + compared(
         image, target, weight_l1=1 - weight_dssim, weight_ssim=-weight_dssim, counted=counted
     )
@@ -180,7 +178,7 @@ def elongation(log_scales: Tensor, at_most: float = 10.0) -> Tensor:
         ArgumentError: If the tensor has another shape or type, or the ratio is below 1.
 
     Source:
-        Xie et al. 2023 (PhysGaussian), eq. 18; OmniRe's sharp-shape regulariser.
+        Xie et al. 2023 (PhysGaussian), the anisotropy regulariser; OmniRe's sharp-shape regulariser.
     """
     if not at_most >= 1:
         raise ArgumentError(f"at_most must be at least 1, got {at_most!r}")
@@ -201,7 +199,7 @@ def mean_opacity(logit_opacities: Tensor) -> Tensor:
         logit_opacities: (N,) with N ≥ 1; differentiable.
 
     Source:
-        Kheradmand et al. 2024 (3DGS-MCMC), eq. 10; weight 0.01 in gsplat.
+        Kheradmand et al. 2024 (3DGS-MCMC), the loss; weight 0.01 in gsplat.
     """
     return logit_opacities.sigmoid().mean()
 
@@ -216,7 +214,7 @@ def mean_scale(log_scales: Tensor, unit_m: float | Tensor = 1.0) -> Tensor:
             the nearest camera, so that far ones may be as large on a picture as near ones.
 
     Source:
-        Kheradmand et al. 2024 (3DGS-MCMC), eq. 10; weight 0.01 in gsplat.
+        Kheradmand et al. 2024 (3DGS-MCMC), the loss; weight 0.01 in gsplat.
     """
     if isinstance(unit_m, Tensor):
         return (log_scales - unit_m.log()[:, None]).exp().mean()

@@ -178,7 +178,7 @@ def elongation(log_scales: Tensor, at_most: float = 10.0) -> Tensor:
         ArgumentError: If the tensor has another shape or type, or the ratio is below 1.
 
     Source:
-        Xie et al. 2023 (PhysGaussian), the anisotropy regulariser; OmniRe's sharp-shape regulariser.
+        Xie et al. 2023 (PhysGaussian), the anisotropy regulariser; OmniRe's of sharp shapes.
     """
     if not at_most >= 1:
         raise ArgumentError(f"at_most must be at least 1, got {at_most!r}")

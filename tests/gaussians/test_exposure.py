@@ -81,7 +81,7 @@ def test_planted_exposures_are_found() -> None:
     exposures = Exposures(KEYS)
     optimiser = torch.optim.Adam(exposures.parameters(), lr=LEARNING_RATE)
     # Signs of an L1 loss shake what is learnt by the length of the steps, which shrink to the end.
-    schedule = torch.optim.lr_scheduler.ExponentialLR(optimiser, 0.01 ** (1 / 600))
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimiser, 0.1 ** (1 / 600))
     for step in range(600):
         row = step % 6
         optimiser.zero_grad()

@@ -38,6 +38,7 @@ from weather_aug.scene.records import (
     part_path,
     streets,
 )
+from weather_aug.scene.route import street_axes
 from weather_aug.scene.shelter import View, shelter_of
 
 EDITORS = ("physical",)
@@ -171,25 +172,6 @@ def _write_shelter(
     record, data = store.encode_shelter(shelter)
     _files.write_whole(work / SHELTER, data)
     return record, {SHELTER: digest_record(data)}
-
-
-def street_axes(entries: Sequence[dict[str, Any]], up_world: Float64) -> Float64:
-    """Axes of the street (3, 3): rows along the first heading, to the left, up.
-
-    The heading is the way the rig went; of a rig that stood, the first camera's view.
-    """
-    up = np.asarray(up_world, np.float64)
-    up = up / np.linalg.norm(up)
-    first = np.array(entries[0]["world_from_camera"])
-    same = [e for e in entries if e["camera"] == entries[0]["camera"]]
-    way = np.array(same[-1]["world_from_camera"])[:3, 3] - first[:3, 3]
-    way -= (way @ up) * up
-    if np.linalg.norm(way) < 1.0:
-        way = first[:3, 2] - (first[:3, 2] @ up) * up
-    if np.linalg.norm(way) < 1e-6:
-        raise ClipError("the first camera looks straight up or down; the street has no heading")
-    along = way / np.linalg.norm(way)
-    return np.stack([along, np.cross(up, along), up])
 
 
 def _check_choices(editor: str, weathers: Sequence[str]) -> None:

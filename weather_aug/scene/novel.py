@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -36,9 +37,15 @@ class NovelFrame(NamedTuple):
     """A frame drawn from Gaussians."""
 
     frame: Frame
-    """Its label is 255 where the drive never showed what is there."""
     seen: Mask
     """(H, W): recorded frames showed what is there."""
+
+    def masked(self) -> NovelFrame:
+        """The same with the label 255 where nothing recorded tells what is there."""
+        if self.frame.label is None:
+            return self
+        label = np.where(self.seen, self.frame.label, np.uint8(IGNORE))
+        return self._replace(frame=replace(self.frame, label=label))
 
 
 def novel_camera(
@@ -60,7 +67,7 @@ def novel_frame(
     poses: Poses | None = None,
     want: Collection[str] = PLANES,
 ) -> NovelFrame:
-    """What `camera` would have taken at `time_s`.
+    """What `camera` would have taken at `time_s`, with the most likely label everywhere.
 
     Args:
         reconstruction: The drive.
@@ -89,13 +96,28 @@ def novel_frame(
         want=want,
     )
     seen = np.ones(shown.opacity.shape, bool) if shown.seen is None else shown.seen
-    label = None if shown.label is None else np.where(seen, shown.label, np.uint8(IGNORE))
     boxes = boxes_at(reconstruction.actors, recorded, time_s, without, poses or {})
     assert shown.image is not None
+    label = None if shown.label is None else _guessed(shown.label, seen)
     frame = Frame(
-        key, time_s, camera, shown.image, label, _stored_depth(shown), shown.normals_world, boxes
+        *(key, time_s, camera, shown.image, label),
+        *(_stored_depth(shown), shown.normals_world, boxes),
     )
     return NovelFrame(frame, seen)
+
+
+def _guessed(label: NDArray[np.uint8], seen: Mask) -> NDArray[np.uint8]:
+    """The label with the nearest pixel's class where nothing was seen and no class is known."""
+    known = label != IGNORE
+    blank = ~known & ~seen
+    if not blank.any() or not known.any():
+        return label
+    _, nearest = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    class_by_seed = np.zeros(int(nearest.max()) + 1, np.uint8)
+    class_by_seed[nearest[known]] = label[known]
+    return np.where(blank, class_by_seed[nearest], label)
 
 
 def _stored_depth(shown: View) -> NDArray[np.float16]:
@@ -162,19 +184,24 @@ def honest(
 
     Args:
         shot: In the weather, by `carried_options` if the frame shows a style.
-        novel: What was rendered.
+        novel: What was rendered: dressed by the most likely labels, so that no seam shows where
+            the recorded frames end.
         lying: What lies on the ground in the frame's style; see `lying_in`.
         options: As they were asked for, not `carried_options`.
     """
     top, left, height, width = shot.window
-    seen = novel.seen[top : top + height, left : left + width]
-    label, invalid = shot.label, shot.invalid | ~seen
+    unseen = ~novel.seen[top : top + height, left : left + width]
+    label, full = shot.label, shot.label_full
+    invalid = shot.invalid | unseen
     limits = snow_limits(lying, options)
     if limits is not None and label is not None:
         buried = buried_borders(novel.frame, shot.window, limits)
         label = kept_labels(label, buried, options.labels)
         invalid |= buried | covered_faces(novel.frame, shot.window, limits)
-    return replace(shot, label=label, invalid=invalid)
+    if label is not None and full is not None:
+        label, full = (np.where(unseen, np.uint8(IGNORE), plane) for plane in (label, full))
+    frame = novel.masked().frame
+    return replace(shot, label=label, label_full=full, invalid=invalid, frame=frame)
 
 
 def warm_up() -> None:

@@ -8,7 +8,6 @@ goes on after the last whole step, and within the fit from its last checkpoint.
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -38,7 +37,6 @@ if TYPE_CHECKING:
 
 FITTING = "fitting"
 """Folder of journals and checkpoints in a work folder; a finished scene has none."""
-CHECKPOINTS = "checkpoints-"
 TIMINGS = ("minutes",)
 """What the fit tells of itself and differs from one run to the next; a scene's bytes do not."""
 
@@ -54,18 +52,30 @@ class Wanted(NamedTuple):
 
 
 class StoredFrames(Sequence[Frame]):
-    """Frames of a scene folder, read each time they are asked for."""
+    """Frames of a scene folder, read each time they are asked for.
 
-    def __init__(self, folder: Path, records: Sequence[FrameRecord]) -> None:
-        self.folder, self.records = folder, records
+    Args:
+        folder: With the frames' files.
+        records: Of the frames, in their order.
+        change: What becomes of each frame.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        records: Sequence[FrameRecord],
+        change: Callable[[FrameRecord, Frame], Frame] = lambda record, frame: frame,
+    ) -> None:
+        self.folder, self.records, self.change = folder, records, change
 
     def __len__(self) -> int:
         return len(self.records)
 
     def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        return store.read_frame(self.folder, self.records[index])
+            return StoredFrames(self.folder, self.records[index], self.change)
+        record = self.records[index]
+        return self.change(record, store.read_frame(self.folder, record))
 
 
 def wanted_of(options: FitOptions | None, styles: Sequence[str]) -> Wanted:
@@ -109,20 +119,23 @@ def write_reconstruction(
     with _files.reported(work):
         (work / FITTING).mkdir(exist_ok=True)
         (work / GAUSSIANS).mkdir(exist_ok=True)
-    head = {"frames": _digest_of(files), "options": _digest_of(asdict(wanted.options))}
+    # The result does not depend on threads.
+    options = asdict(wanted.options) | {"threads": 0}
+    head = {"frames": _digest_of(files), "options": _digest_of(options)}
     geometry, files_of_geometry = _done(
-        work, "geometry", head, lambda: _geometry(work, manifest, wanted.options, head, progress)
+        work, "geometry", head, lambda: _geometry(work, manifest, wanted.options, progress)
     )
     bare = _read(work, geometry, files_of_geometry)
     head = {"geometry": _digest_of(files_of_geometry)} | head
     steps: dict[str, Callable[[], Made]] = {
         "labels": lambda: _labels(work, manifest, wanted.options, bare, progress)
     }
-    for name in wanted.styles:
-        steps[f"style.{name}"] = _style_step(work, manifest, wanted.options, bare, name, progress)
+    if wanted.styles:
+        steps["styles"] = lambda: _styles(work, manifest, wanted, bare, progress)
     entries, written = [geometry], dict(files_of_geometry)
     for name, make in steps.items():
-        entry, made = _done(work, name, head, make)
+        more = {"styles": list(wanted.styles)} if name == "styles" else {}
+        entry, made = _done(work, name, head | more, make)
         entries.append(entry)
         written |= made
     entry = joined(entries)
@@ -136,38 +149,30 @@ def _done(
     work: Path, step: str, head: dict[str, Any], make: Callable[[], Made]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """A step's entry and files; made only if it is not there already, for the same head."""
-
-    def clean(work: Path) -> None:
-        for folder in (work / FITTING).glob(f"{CHECKPOINTS}*"):
-            if step == "geometry" and folder != _checkpoints(work, head):
-                shutil.rmtree(folder)
-
     head = {"step": step, "version": __version__, **head}
     task = Round(
-        *(step, f"{FITTING}/{step}.jsonl", head, (step,), lambda _: make(), clean),
+        *(step, f"{FITTING}/{step}.jsonl", head, (step,), lambda _: make(), lambda _: None),
         tries_first=False,
     )
     record = make_all(task, work, progress=False)[step]
     return record["entry"], record["files"]
 
 
-def _checkpoints(work: Path, head: dict[str, Any]) -> Path:
-    """Folder of a fit's checkpoints: one for each of all the things that it depends on."""
-    return work / FITTING / f"{CHECKPOINTS}{_digest_of(head)[:16]}"
-
-
-def _geometry(
-    work: Path, manifest: Manifest, options: FitOptions, head: dict[str, Any], progress: bool
-) -> Made:
+def _geometry(work: Path, manifest: Manifest, options: FitOptions, progress: bool) -> Made:
     from weather_aug.gaussians.fit import fit
 
-    folder = _checkpoints(work, head)
+    # The fit knows its own checkpoints from others.
+    folder = work / FITTING / "checkpoints"
     with _files.reported(folder):
         folder.mkdir(exist_ok=True)
     frames = StoredFrames(work, manifest.frames)
     fitted = fit(frames, options, checkpoints=folder, progress=progress)
     entry, parts = encode_geometry(fitted.reconstruction)
-    told = {name: value for name, value in fitted.record.items() if name not in TIMINGS}
+    told = {
+        name: float(value)
+        for name, value in fitted.record.items()
+        if isinstance(value, int | float) and name not in TIMINGS
+    }
     return entry | {"fit": told}, parts
 
 
@@ -178,44 +183,50 @@ def _labels(
     from weather_aug.gaussians.frames import resized
     from weather_aug.gaussians.labels import fit_labels, recorded_support
 
-    frames = [resized(frame, options.scale) for frame in StoredFrames(work, manifest.frames)]
+    def smaller(_: FrameRecord, frame: Frame) -> Frame:
+        return resized(frame, options.scale)
+
+    frames = list(StoredFrames(work, manifest.frames, smaller))
     if any(frame.label is not None for frame in frames):
-        return encode_labels(fit_labels(scene, frames, progress=progress))
-    support = recorded_support(scene, frames, progress=progress)
+        labelled = fit_labels(scene, frames, threads=options.threads, progress=progress)
+        return encode_labels(labelled)
+    support = recorded_support(scene, frames, threads=options.threads, progress=progress)
     return encode_labels(replace(scene, support=support))
 
 
-def _style_step(
-    work: Path,
-    manifest: Manifest,
-    options: FitOptions,
-    scene: Reconstruction,
-    name: str,
-    progress: bool,
-) -> Callable[[], Made]:
-    def made() -> Made:
-        from weather_aug.gaussians.frames import resized
-        from weather_aug.gaussians.styles import fit_style
+def _styles(
+    work: Path, manifest: Manifest, wanted: Wanted, scene: Reconstruction, progress: bool
+) -> Made:
+    """Colours of all styles at once: they share the work of drawing."""
+    from weather_aug.gaussians.frames import resized
+    from weather_aug.gaussians.styles import fit_styles
 
-        frames = [
-            resized(styled_frame(work, manifest, record, name), options.scale)
-            for record in manifest.frames
-        ]
-        return encode_style(name, fit_style(scene, frames, progress=progress))
+    def frames_in(style: str) -> StoredFrames:
+        def edit(record: FrameRecord, frame: Frame) -> Frame:
+            return resized(styled_frame(work, manifest, record, frame, style), options.scale)
 
-    return made
+        return StoredFrames(work, manifest.frames, edit)
+
+    options = wanted.options
+    edited_by_style = {name: frames_in(name) for name in wanted.styles}
+    styled = fit_styles(scene, edited_by_style, threads=options.threads, progress=progress)
+    made = [encode_style(name, styled.styles[name]) for name in wanted.styles]
+    parts = {path: data for _, files in made for path, data in files.items()}
+    return joined(entry for entry, _ in made), parts
 
 
-def styled_frame(work: Path, manifest: Manifest, record: FrameRecord, style: str) -> Frame:
+def styled_frame(
+    work: Path, manifest: Manifest, record: FrameRecord, frame: Frame, style: str
+) -> Frame:
     """A stored frame as the editor shows it in a style's weather, with nothing in the air.
 
     Args:
         work: Folder with the frame's files.
         manifest: Of all frames.
         record: Of the frame, with its layers.
+        frame: As it was recorded.
         style: Name of a weather.
     """
-    frame = store.read_frame(work, record)
     layers = store.read_layers(work, record, frame.label)
     weather = style_weather(style)
     assert layers is not None and weather is not None

@@ -249,7 +249,7 @@ def _check_shapes(arrays: Arrays, expected: dict[str, tuple[int, ...]]) -> None:
 
 def _gaussians(arrays: Arrays, which: str) -> Gaussians:
     count = len(arrays[f"{which}_means_m"])
-    fields = {name: arrays.get(f"{which}_{name}") for name in SETS}
+    fields: dict[str, Any] = {name: arrays.get(f"{which}_{name}") for name in SETS}
     scores = fields["class_scores"]
     if scores is None:
         fields["class_scores"] = np.zeros((count, 0), np.float16)
@@ -306,8 +306,11 @@ def _cameras(arrays: Arrays, record: ReconstructionRecord) -> dict[FrameKey, Cam
 
 def _style(arrays: Arrays, name: str, count: int, moving: int, side: int) -> Style:
     style = Style(**{part: arrays[style_array(name, part)] for part in STYLE_KINDS})
-    shapes = {"sh": (count, style.sh.shape[1], 3), "actor_sh": (moving, style.actor_sh.shape[1], 3)}
-    shapes |= {"sky": (6, side, side, 3)}
+    shapes: dict[str, tuple[int, ...]] = {
+        "sh": (count, style.sh.shape[1], 3),
+        "actor_sh": (moving, style.actor_sh.shape[1], 3),
+        "sky": (6, side, side, 3),
+    }
     _check_shapes(arrays, {style_array(name, part): shape for part, shape in shapes.items()})
     if not {style.sh.shape[1], style.actor_sh.shape[1]} <= set(SH_COEFFICIENTS):
         raise ValueError(f"style {name} must hold {SH_COEFFICIENTS} coefficients a Gaussian")

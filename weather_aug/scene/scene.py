@@ -261,15 +261,8 @@ class WeatherScene:
         # Loads torch.
         from weather_aug.scene.novel import honest
 
-        novel = self.frame_from(
-            key,
-            viewpoint,
-            style=style,
-            amount=amount,
-            without=without_actors,
-            poses=poses,
-            normals=False,
-        )
+        shown = dict(style=style, amount=amount, without=without_actors, poses=poses)
+        novel = self._novel(key, viewpoint, None, None, normals=False, **shown)
         dressing = options if style is None else carried_options(options)
         look = self._looked_at
         shot = self._rendered(novel.frame, look, weather, seed, window, air, dressing)
@@ -341,32 +334,32 @@ class WeatherScene:
                 are given, or a style or a track is unknown.
             SceneError: If a file of the scene cannot be read any more.
         """
+        if camera is not None and viewpoint is not None:
+            raise ArgumentError("give a viewpoint or a camera, not both")
+        shown = dict(style=style, amount=amount, without=without, poses=poses)
+        return self._novel(key, viewpoint, camera, time_s, normals=normals, **shown).masked()
+
+    def _novel(
+        self,
+        key: FrameKey,
+        viewpoint: Viewpoint | None,
+        camera: Camera | None,
+        time_s: float | None,
+        *,
+        normals: bool,
+        **shown: Any,
+    ) -> NovelFrame:
+        """`frame_from` with the most likely label where nothing was seen."""
         from weather_aug.scene.novel import PLANES, novel_camera, novel_frame
 
         reconstruction = self._gaussians()
-        record = self._record(key)
-        if camera is not None and viewpoint is not None:
-            raise ArgumentError("give a viewpoint or a camera, not both")
-        if viewpoint is not None and not isinstance(viewpoint, Viewpoint):
-            raise ArgumentError(
-                f"viewpoint must be a Viewpoint, got {type(viewpoint).__name__}; write "
-                "Viewpoint(lateral_m=1.0)"
-            )
-        recorded = store.read_frame(self.path, record)
+        recorded = store.read_frame(self.path, self._record(key))
         if camera is None:
             axes_world = self.manifest.axes_world
             camera = novel_camera(reconstruction, recorded, axes_world, viewpoint or Viewpoint())
-        return novel_frame(
-            reconstruction,
-            recorded,
-            camera,
-            recorded.time_s if time_s is None else finite("time_s", time_s),
-            style=style,
-            amount=amount,
-            without=without,
-            poses=poses,
-            want=PLANES if normals else PLANES[:-1],
-        )
+        time_s = recorded.time_s if time_s is None else finite("time_s", time_s)
+        want = PLANES if normals else PLANES[:-1]
+        return novel_frame(reconstruction, recorded, camera, time_s, want=want, **shown)
 
     def _gaussians(self) -> Reconstruction:
         if self.reconstruction is None:

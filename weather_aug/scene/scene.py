@@ -16,12 +16,11 @@ from weather_aug.errors import ArgumentError, IntegrityError, printable
 from weather_aug.gaussians.types import Reconstruction
 from weather_aug.particles.shelter import Shelter
 from weather_aug.render.compose import RenderedFrame, render
-from weather_aug.render.fields import RigMotion
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene import store
 from weather_aug.scene.layers import Street, layers_seen
 from weather_aug.scene.reconstruction import read_reconstruction
-from weather_aug.scene.records import FrameRecord, Manifest, streets
+from weather_aug.scene.records import FrameRecord, Manifest, rig_motion, streets
 from weather_aug.scene.styles import carried_options, lying_in
 from weather_aug.scene.viewpoint import Viewpoint, raised_height_m
 from weather_aug.timeline import WeatherTimeline
@@ -293,7 +292,7 @@ class WeatherScene:
             window=window,
             air=air,
             shelter=self.shelter,
-            rig=self._rig_motion(frame.key) if options.needs_rig else None,
+            rig=rig_motion(self.manifest.frames, frame.key) if options.needs_rig else None,
             layers=look(frame) if is_seen else None,
             options=options,
         )
@@ -373,14 +372,6 @@ class WeatherScene:
         """How much higher a frame's camera stands than the recorded one."""
         here, there = frame.camera, self._record(frame.key).camera
         return float(self.manifest.axes_world[2] @ (here.centre_world - there.centre_world))
-
-    def _rig_motion(self, key: FrameKey) -> RigMotion:
-        """Of the clip's first camera up to the moment of a frame, or to the last one before it."""
-        first = self.manifest.frames[0]
-        seen = [r for r in self.manifest.frames if r.key.camera == first.key.camera]
-        before = [r for r in seen if r.key.time_index <= key.time_index]
-        now = before[-1] if before else seen[0]
-        return RigMotion(first.camera.world_from_camera, now.camera.world_from_camera)
 
     def damaged_files(self) -> list[str]:
         """Compare every file with its digest; one sentence for each that has changed."""

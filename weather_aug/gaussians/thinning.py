@@ -61,7 +61,6 @@ def voxels_of(points: Float64, smallest_m: float, count: int) -> tuple[float, ND
 
     There are at most `count`.
     """
-
     # From a corner, so that in the end a single voxel holds them all.
     corner = points.min(axis=0)
 

@@ -27,7 +27,9 @@ class _Slowly(BoxStreet):
         return replace(camera, world_from_camera=pose)
 
 
-def frames(views: int = 14, width: int = 320, height: int = 192, noise: float = 0.01) -> list[Frame]:
+def frames(
+    views: int = 14, width: int = 320, height: int = 192, noise: float = 0.01
+) -> list[Frame]:
     """A drive of a metre a step; the depth has relative `noise`."""
     street = _Slowly(
         boxes=(*FACADES, *CARS[2:12]), frames=views, width=FINER * width, height=FINER * height

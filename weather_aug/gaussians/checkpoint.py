@@ -33,10 +33,10 @@ def save(folder: Path, head: Mapping[str, Any], state: Mapping[str, Tensor]) -> 
     """
     with _files.reported(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    arrays = {name: value.numpy() for name, value in state.items()}
-    text = np.frombuffer(json.dumps(head).encode(), np.uint8)
+    arrays: dict[str, Any] = {name: value.numpy() for name, value in state.items()}
+    arrays[HEAD] = np.frombuffer(json.dumps(head).encode(), np.uint8)
     buffer = io.BytesIO()
-    np.savez(buffer, **{HEAD: text}, **arrays)
+    np.savez(buffer, **arrays)
     _files.write_whole(folder / NAME, buffer.getvalue())
 
 

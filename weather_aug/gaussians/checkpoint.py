@@ -50,7 +50,8 @@ def load(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor]] | None:
     if not path.exists():
         return None
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        # numpy leaves a file open that it opened itself and could not read.
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             state = {name: torch.from_numpy(arrays[name]) for name in arrays.files if name != HEAD}
             return json.loads(arrays[HEAD].tobytes()), state
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:

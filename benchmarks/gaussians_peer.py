@@ -50,7 +50,9 @@ def draw(
     starts = lengths.cumsum(0) - lengths
     parts, drawn = [], []
     for tiles in _groups(lengths):
-        parts.append(_blended(ellipses, values, members, starts[tiles], lengths[tiles], tiles, across))
+        parts.append(
+            _blended(ellipses, values, members, starts[tiles], lengths[tiles], tiles, across)
+        )
         drawn.append(tiles)
     flat = values.new_zeros(across * down, TILE_PX**2, values.shape[1])
     if drawn:
@@ -90,9 +92,10 @@ def _ellipses(
     det = _determinants(covariance)
     share = _determinants(sharp) / det
     variances = covariance.diagonal(dim1=1, dim2=2)
-    conic = torch.stack(
-        [covariance[:, 1, 1], -covariance[:, 0, 1], covariance[:, 0, 0]], dim=1
-    ) / det[:, None]
+    conic = (
+        torch.stack([covariance[:, 1, 1], -covariance[:, 0, 1], covariance[:, 0, 0]], dim=1)
+        / det[:, None]
+    )
     opacity = opacities[order] * share.clamp(min=2.5e-5).sqrt()
     return Ellipses(order, z, slope * focal + principal, variances, conic, opacity)
 

@@ -54,9 +54,7 @@ def case(
     def uniform(low, high, *shape):
         return low + (high - low) * torch.rand(*shape, generator=draw, dtype=torch.float64)
 
-    pinhole = Pinhole(
-        0.9 * width, 1.0 * width, 0.45 * width, 0.55 * height - 0.3, width, height
-    )
+    pinhole = Pinhole(0.9 * width, 1.0 * width, 0.45 * width, 0.55 * height - 0.3, width, height)
     low_z, high_z, low_px, high_px, low_opacity, spread = KINDS[kind]
     z = uniform(low_z, high_z, count)
     # Places on and around the picture, `spread` times its size.
@@ -64,9 +62,7 @@ def case(
     v = (uniform(-0.5, 0.5, count) * spread + 0.5) * height
     slopes = torch.stack([(u - pinhole.cx_px) / pinhole.fx_px, (v - pinhole.cy_px) / pinhole.fy_px])
     places = torch.stack([slopes[0] * z, slopes[1] * z, z], dim=-1)
-    sizes_px = torch.exp(
-        uniform(0, 1, count, 3) * torch.log(torch.tensor(high_px / low_px)) + low_px_log(low_px)
-    )
+    sizes_px = low_px * (high_px / low_px) ** uniform(0, 1, count, 3)
     scales = sizes_px * z.abs().clamp(min=0.1)[:, None] / pinhole.fx_px
     camera_from_world = pose(uniform(-1, 1, 4), uniform(-3, 3, 3))
     rotation, shift = camera_from_world[:3, :3], camera_from_world[:3, 3]
@@ -84,10 +80,6 @@ def case(
         antialiased,
     )
     return made.in_type(torch.float32, requires_grad=False)
-
-
-def low_px_log(low_px):
-    return torch.log(torch.tensor(low_px, dtype=torch.float64))
 
 
 def pose(quaternion, shift_m):

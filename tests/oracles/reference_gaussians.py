@@ -57,27 +57,24 @@ def picture(
     background=None,
     antialiased=True,
     near_m=NEAR_M,
+    shift_px=None,
 ):
-    """The picture of float64 tensors, as the rasteriser promises it."""
+    """The picture of float64 tensors, as the rasteriser promises it.
+
+    `shift_px` (N, 2) moves the centres on the picture and nothing else: its gradient is theirs.
+    """
     splats = projected(
-        means_m,
-        quaternions,
-        scales_m,
-        opacities,
-        camera_from_world,
-        pinhole,
-        antialiased,
-        near_m,
+        means_m, quaternions, scales_m, opacities, camera_from_world, pinhole, antialiased, near_m
     )
+    if shift_px is not None:
+        splats = splats._replace(centre=splats.centre + shift_px[splats.order])
     height, width = pinhole.height, pinhole.width
     alpha, doubtful = alphas(splats, height, width)
     after = torch.cumprod(1 - alpha, dim=0)
     reached = torch.cat([torch.ones_like(after[:1]), after])[:-1]
     # What does not pass light on any more is not drawn, and nothing behind it: it only falls.
     drawn = after > LEAST_TRANSMITTANCE
-    doubtful = doubtful | (
-        (alpha > 0) & ((after / LEAST_TRANSMITTANCE - 1).abs() < 10 * DOUBT)
-    )
+    doubtful = doubtful | ((alpha > 0) & ((after / LEAST_TRANSMITTANCE - 1).abs() < 10 * DOUBT))
     weight = torch.where(drawn, alpha * reached, 0.0)
     left = torch.where(drawn, 1 - alpha, 1.0).prod(dim=0)
     opacity = weight.sum(dim=0)
@@ -170,9 +167,7 @@ def alphas(splats, height, width):
         indexing="ij",
     )
     offset = torch.stack([u, v], dim=-1) - splats.centre[:, None, None]
-    power = torch.einsum(
-        "nhwi,nij,nhwj->nhw", offset, torch.linalg.inv(splats.covariance), offset
-    )
+    power = torch.einsum("nhwi,nij,nhwj->nhw", offset, torch.linalg.inv(splats.covariance), offset)
     raw = splats.opacity[:, None, None] * torch.exp(-0.5 * power)
     alpha = raw.clamp(max=MOST_ALPHA)
     doubtful = ((raw / LEAST_ALPHA - 1).abs() < DOUBT) | ((raw / MOST_ALPHA - 1).abs() < DOUBT)
@@ -203,7 +198,9 @@ def harmonics(direction, degree):
         for m in range(-order, order + 1):
             along = sum(
                 coefficient * z**power
-                for power, coefficient in enumerate(legendre.deriv(abs(m)).coef if m else legendre.coef)
+                for power, coefficient in enumerate(
+                    legendre.deriv(abs(m)).coef if m else legendre.coef
+                )
             )
             turn = around ** abs(m) if m else torch.ones_like(around)
             factorials = np.prod([1.0 / k for k in range(order - abs(m) + 1, order + abs(m) + 1)])

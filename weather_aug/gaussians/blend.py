@@ -134,7 +134,18 @@ def blend(parts, planes, starts, ranks, tiles, left, blended, ends):
 
 @reassociated
 def blend_back(
-    parts, planes, starts, ranks, tiles, ends, left, blended, d_left, d_blended, has_shape, by_entry,
+    parts,
+    planes,
+    starts,
+    ranks,
+    tiles,
+    ends,
+    left,
+    blended,
+    d_left,
+    d_blended,
+    has_shape,
+    by_entry,
     d_rows,
 ):
     """Gradients of the tiles from tiles[0] to before tiles[1], added to `d_rows`.

@@ -3,84 +3,36 @@
 import importlib.util
 import math
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracles import reference_gaussians as reference
-from oracles.random_gaussians import KINDS, LEAVES, case
+from oracles.gaussian_checks import (
+    GRADIENT,
+    PLANES,
+    check_gradients,
+    check_picture,
+    expected,
+    loss,
+    ours,
+    weights,
+)
+from oracles.random_gaussians import KINDS, LEAVES, RARE, case
 
 from weather_aug.errors import ArgumentError
-from weather_aug.gaussians.rasterise import NEAR_M, rasterise
+from weather_aug.gaussians.rasterise import NEAR_M
 from weather_aug.gaussians.types import Pinhole
 
-FORWARD, GRADIENT = 1e-4, 1e-4
-PLANES = ("colours", "opacity", "depth_m")
-MOST_DOUBTFUL = 0.02
-"""Of the pixels: where a threshold is so near that float32 may decide otherwise."""
 
-
-def ours(case, **options):
-    leaves = [getattr(case, name) for name in LEAVES]
-    fixed = {"background": case.background, "antialiased": case.antialiased}
-    return rasterise(*leaves, case.pinhole, **fixed | options)
-
-
-def expected(case, **options):
-    leaves = [getattr(case, name) for name in LEAVES]
-    return reference.picture(*leaves, case.pinhole, case.background, case.antialiased, **options)
-
-
-def weights(picture, seed=1):
-    """Of a loss over all planes, 0 where the reference is in doubt."""
-    draw = torch.Generator().manual_seed(seed)
-    sure = ~picture.doubtful
-    planes = [getattr(picture, name) for name in PLANES]
-    shapes = [(plane.shape, sure[(...,) + (None,) * (plane.ndim - 2)]) for plane in planes]
-    return [
-        torch.randn(shape, generator=draw, dtype=torch.float64) * mask for shape, mask in shapes
-    ]
-
-
-def loss(picture, weights):
-    return sum(
-        (getattr(picture, name) * weight.to(picture.opacity.dtype)).sum()
-        for name, weight in zip(PLANES, weights, strict=True)
-    )
-
-
-def check_picture(case):
-    """Our picture is the reference's."""
-    wanted, found = expected(case.in_type(torch.float64, False)), ours(case)
-    sure = ~wanted.doubtful
-    assert wanted.doubtful.sum() <= 1 + MOST_DOUBTFUL * sure.numel()
-    for name in PLANES:
-        plane = getattr(found, name)
-        assert plane.dtype == torch.float32
-        assert plane.shape == getattr(wanted, name).shape
-        off = (getattr(wanted, name) - plane).abs()[sure]
-        assert off.numel() == 0 or off.max() <= FORWARD, f"{name} is off by {off.max():.2g}"
-    return wanted, found
-
-
-def check_gradients(case):
-    """Our gradients of every input are the reference's, by the norm of their difference."""
-    exact, single = case.in_type(torch.float64), case.in_type(torch.float32)
-    shift = torch.zeros(len(case.means_m), 2, dtype=torch.float64, requires_grad=True)
-    wanted, found = expected(exact, shift_px=shift), ours(single)
-    chosen = weights(wanted)
-    loss(wanted, chosen).backward()
-    loss(found, chosen).backward()
-    pairs = {name: (leaf.grad, getattr(single, name).grad) for name, leaf in exact.tensors.items()}
-    pairs["centres_px"] = (shift.grad, found.centres_px.grad)
-    for name, (right, got) in pairs.items():
-        assert got.dtype == torch.float32
-        off, norm = (right - got).norm().item(), right.norm().item()
-        assert off <= GRADIENT * norm, f"gradient of {name} is off by {off / norm:.2g}"
-    return pairs
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Torch's own threads cost more than they bring on pictures of this size."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.mark.parametrize("antialiased", [True, False])
@@ -100,15 +52,26 @@ def test_gradients_of_all_inputs_are_the_references(kind, seed, antialiased):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_gradients_of_each_gaussian_are_the_references(kind):
-    """One that few pixels show counts as much as one that fills the picture."""
+    """The norm over all is that of the few largest; here each counts by its own."""
     pairs = check_gradients(case(kind, 2))
     for name in ("means_m", "quaternions", "scales_m", "opacities", "colours"):
         right, got = (gradient.reshape(60, -1) for gradient in pairs[name])
         off, norm = (right - got).norm(dim=1), right.norm(dim=1)
-        shown = norm > 1e-6 * norm.max()
+        # What hides behind 0.999 of opacity has the rounding of what is before it, too.
+        shown = norm > 1e-2 * norm.max()
         relative = off[shown] / norm[shown]
         assert relative.median() <= GRADIENT, name
-        assert relative.quantile(0.9) <= 10 * GRADIENT, name
+        assert relative.max() <= 20 * GRADIENT, name
+
+
+@pytest.mark.parametrize("kind", RARE)
+def test_rare_ones_are_the_references(kind):
+    """At the floor of the compensation and at the cap of alpha, where gradients end."""
+    made = case(kind, 0)
+    check_picture(made)
+    # Most specks are alone in their pixel, where depth does not change with its weight: what
+    # float32 leaves of w z / w² - z / w is noise.
+    check_gradients(made, {"specks": 5 * GRADIENT}.get(kind, GRADIENT))
 
 
 @pytest.mark.parametrize("channels", [1, 3, 19])
@@ -367,150 +330,37 @@ def test_an_empty_picture_is_refused():
         ours(replace(made, pinhole=made.pinhole._replace(width=0)))
 
 
-def _unlike(**values):
-    def plant(patch):
-        for name, value in values.items():
-            patch.setattr(reference, name, value)
-
-    return plant
-
-
-def _unnormalised(patch):
-    patch.setattr(torch.Tensor, "norm", lambda self, **_: torch.ones_like(self[..., :1]))
-
-
-def _pixel_corners(patch):
-    right = reference.projected
-
-    def wrong(*args):
-        splats = right(*args)
-        return splats._replace(centre=splats.centre - 0.5)
-
-    patch.setattr(reference, "projected", wrong)
-
-
-def _far_to_near(patch):
-    right = reference.projected
-
-    def wrong(*args):
-        splats = right(*args)
-        return reference.Splats(*(values.flip(0) for values in splats))
-
-    patch.setattr(reference, "projected", wrong)
-
-
-def _drawn_before_stopping(patch):
-    """The splat that takes the last light is drawn, as it is not in 3DGS."""
-    right = torch.cumprod
-
-    def wrong(values, dim):
-        after = right(values, dim)
-        ones = torch.ones_like(after[:1])
-        before = torch.cat([ones, after])[:-1]
-        live = before > reference.LEAST_TRANSMITTANCE
-        return torch.where(live, after.clamp(min=1.001 * reference.LEAST_TRANSMITTANCE), after)
-
-    patch.setattr(torch, "cumprod", wrong)
-
-
-FAULTS = {
-    "dilation of mip-splatting": ("mixed", True, _unlike(DILATION_PX2=0.1)),
-    "clamp at the picture's edge": ("off-axis", True, _unlike(CLAMP_MARGIN=0.0)),
-    "clamp far outside": ("off-axis", True, _unlike(CLAMP_MARGIN=10.0)),
-    "compensation without a floor": ("tiny", True, _unlike(LEAST_COMPENSATION=0.0)),
-    "no compensation": ("mixed", True, _unlike(LEAST_COMPENSATION=1.0)),
-    "cap of gsplat 1.5": ("opaque", True, _unlike(MOST_ALPHA=0.999)),
-    "nothing is cut": ("mixed", False, _unlike(LEAST_ALPHA=1e-4)),
-    "stop ten times as early": ("opaque", False, _unlike(LEAST_TRANSMITTANCE=1e-3)),
-    "the last one is drawn": ("opaque", False, _drawn_before_stopping),
-    "quaternions as they are": ("mixed", True, _unnormalised),
-    "pixel centres at one half": ("mixed", True, _pixel_corners),
-    "far to near": ("mixed", True, _far_to_near),
-}
-
-
-@pytest.mark.parametrize("check", [check_picture, check_gradients])
-@pytest.mark.parametrize("name", FAULTS)
-def test_faults_are_found(name, check, monkeypatch):
-    """Each of what others do, in the place of what we do, makes picture and gradients differ."""
-    kind, antialiased, plant = FAULTS[name]
-    made = case(kind, 0, antialiased=antialiased)
-    plant(monkeypatch)
-    with pytest.raises(AssertionError, match="off by"):
-        check(made)
-
-
-def test_the_reference_is_a_plain_walk_along_each_ray():
-    """Its sums over all Gaussians at once against the loop that they stand for."""
-    made = case("opaque", 1, width=9, height=6).in_type(torch.float64, False)
-    wanted = expected(made)
-    leaves = [getattr(made, name) for name in LEAVES if name != "colours"]
-    splats = reference.projected(*leaves, made.pinhole, made.antialiased)
-    stopped = 0
-    for y in range(6):
-        for x in range(9):
-            light, colour = 1.0, torch.zeros(3, dtype=torch.float64)
-            for n, index in enumerate(splats.order):
-                offset = torch.tensor([x, y]) - splats.centre[n]
-                power = offset @ torch.linalg.solve(splats.covariance[n], offset)
-                alpha = min(0.99, float(splats.opacity[n]) * math.exp(-0.5 * power))
-                if alpha < 1 / 255:
-                    continue
-                if light * (1 - alpha) <= 1e-4:
-                    stopped += 1
-                    break
-                colour += light * alpha * made.colours[index]
-                light *= 1 - alpha
-            colour += light * made.background
-            assert torch.allclose(wanted.colours[y, x], colour, rtol=0, atol=1e-12)
-            assert wanted.opacity[y, x] == pytest.approx(1 - light, abs=1e-12)
-    assert stopped > 10
-
-
-def test_the_references_gradients_are_differences():
-    made = case("mixed", 3, count=5, width=6, height=5).in_type(torch.float64)
-
-    def planes(*leaves):
-        changed = replace(made, **dict(zip(made.tensors, leaves, strict=True)))
-        return [getattr(expected(changed), name) for name in PLANES]
-
-    assert torch.autograd.gradcheck(planes, tuple(made.tensors.values()), atol=1e-5, rtol=1e-3)
-
-
-def test_gsplat_draws_the_same_on_cuda():
-    """Both look at one scene; gsplat's pixel centres lie at one half, ours at integers."""
+@pytest.fixture
+def cuda():
     if not torch.cuda.is_available() or importlib.util.find_spec("gsplat") is None:
         pytest.skip("needs CUDA and gsplat: pip install 'weather-aug[gsplat]'")
-    from gsplat import rasterization
+    return "cuda"
 
+
+def test_gsplat_draws_the_same_on_cuda(cuda):
     made = case("mixed", 0, count=500, width=319, height=183)
-    # gsplat 1.5 caps alpha at 0.999, later versions at 0.99.
+    # gsplat 1.5 caps alpha at 0.999, later versions and we at 0.99.
     made = replace(made, opacities=made.opacities.clamp(max=0.95))
-    on_gpu = {name: leaf.cuda() for name, leaf in made.tensors.items()}
-    fx, fy, cx, cy, width, height = made.pinhole
-    intrinsics = torch.tensor([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1.0]]).cuda()
-    pictures, opacity, _ = rasterization(
-        on_gpu["means_m"],
-        torch.nn.functional.normalize(on_gpu["quaternions"], dim=1),
-        on_gpu["scales_m"],
-        on_gpu["opacities"],
-        on_gpu["colours"],
-        on_gpu["camera_from_world"][None],
-        intrinsics[None],
-        width,
-        height,
-        near_plane=NEAR_M,
-        rasterize_mode="antialiased",
-        render_mode="RGB+ED",
-        backgrounds=on_gpu["background"][None],
+    here = made.in_type(torch.float32)
+    there = replace(
+        made, **{name: leaf.to(cuda).requires_grad_() for name, leaf in made.tensors.items()}
     )
-    found = ours(made)
-    psnr = partial(_psnr, 1.0)
-    assert psnr(pictures[0, ..., :3].cpu(), found.colours) >= 45
-    assert psnr(opacity[0, ..., 0].cpu(), found.opacity) >= 45
+    found, wanted = ours(here), ours(there)
+    assert wanted.colours.is_cuda
+    assert _psnr(1.0, wanted.colours.cpu(), found.colours) >= 45
+    assert _psnr(1.0, wanted.opacity.cpu(), found.opacity) >= 45
     solid = found.opacity > 0.5
-    depths = pictures[0, ..., 3].cpu()[solid], found.depth_m[solid]
-    assert _psnr(float(depths[1].max()), *depths) >= 45
+    assert _psnr(15.0, wanted.depth_m.cpu()[solid], found.depth_m[solid]) >= 45
+    drawn = (found.radii_px > 0) & (wanted.radii_px.cpu() > 0)
+    assert (wanted.centres_px.cpu() - found.centres_px)[drawn].abs().max() <= 1e-2
+    goal = torch.rand(found.colours.shape, generator=torch.Generator().manual_seed(0))
+    ((found.colours - goal) ** 2).sum().backward()
+    ((wanted.colours - goal.to(cuda)) ** 2).sum().backward()
+    for name, leaf in here.tensors.items():
+        right = getattr(there, name).grad.cpu()
+        cosine = torch.nn.functional.cosine_similarity(right.flatten(), leaf.grad.flatten(), dim=0)
+        assert cosine >= 0.99, name
+    assert wanted.centres_px.grad.shape == found.centres_px.grad.shape
 
 
 def _psnr(peak, a, b):

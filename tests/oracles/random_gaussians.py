@@ -1,4 +1,4 @@
-"""Gaussians for the rasteriser's tests: drawn from a seed, float32, some of every difficult kind."""
+"""Gaussians for the rasteriser's tests: drawn from a seed, float32, of every difficult kind."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -41,21 +41,22 @@ def case(
     kind="mixed",
     seed=0,
     *,
-    count=60,
+    count=None,
     channels=3,
     width=53,
     height=37,
     background=True,
     antialiased=True,
 ):
-    """Gaussians of one `kind` of KINDS before a turned and shifted camera."""
+    """Gaussians of one `kind` of KINDS or RARE before a turned and shifted camera."""
+    count = RARE_COUNTS.get(kind, 60) if count is None else count
     draw = torch.Generator().manual_seed(seed)
 
     def uniform(low, high, *shape):
         return low + (high - low) * torch.rand(*shape, generator=draw, dtype=torch.float64)
 
     pinhole = Pinhole(0.9 * width, 1.0 * width, 0.45 * width, 0.55 * height - 0.3, width, height)
-    low_z, high_z, low_px, high_px, low_opacity, spread = KINDS[kind]
+    low_z, high_z, low_px, high_px, low_opacity, spread = (KINDS | RARE)[kind]
     z = uniform(low_z, high_z, count)
     # Places on and around the picture, `spread` times its size.
     u = (uniform(-0.5, 0.5, count) * spread + 0.5) * width
@@ -106,3 +107,10 @@ KINDS = {
     "opaque": (2.0, 15.0, 2.0, 20.0, 0.9, 1.0),
     "needles": (2.0, 15.0, 0.05, 50.0, 0.2, 1.2),
 }
+RARE = {
+    # Smaller than any pixel sees, and so opaque that they are seen all the same.
+    "specks": (2.0, 15.0, 0.001, 0.02, 0.96, 1.0),
+    # At the cap. Few, because two of them leave exactly as much light as stops a ray.
+    "capped": (2.0, 15.0, 30.0, 90.0, 0.999, 1.2),
+}
+RARE_COUNTS = {"capped": 3}

@@ -146,13 +146,17 @@ def clamped(slope, focal_px, principal_px, extent_px):
 
 def rotations(quaternions):
     """(N, 3, 3) of (w, x, y, z) of any length."""
-    w, x, y, z = (quaternions / quaternions.norm(dim=-1, keepdim=True)).unbind(-1)
+    w, x, y, z = normalised(quaternions).unbind(-1)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def normalised(quaternions):
+    return quaternions / quaternions.norm(dim=-1, keepdim=True)
 
 
 def determinant(matrices):

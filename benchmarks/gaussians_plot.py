@@ -14,8 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchmarks.gaussians import BOTH, FORWARD, THEIRS
-from benchmarks.growth import Power
+from benchmarks.gaussians import BOTH, FORWARD, THEIRS, Growth
 from benchmarks.plot import BLUE, GREEN, OUR_STYLE, PEER_STYLE, VERMILION
 
 LOOKS = {
@@ -33,13 +32,13 @@ def draw(measured: Mapping[str, Any], path: Path) -> None:
     width, height = gaussians["size"]
     _curves(left, gaussians["counts"], gaussians["curves"], "n")
     left.set_title(f"More Gaussians, {width} x {height} pixels")
-    left.set_xlabel("Gaussians (dashed: fitted power laws)")
+    left.set_xlabel("Gaussians (dashed: fits)")
     counts = [5_000, 10_000, 30_000, 100_000, 300_000]
     left.set_xticks(counts, [f"{count // 1000}k" for count in counts])
     _curves(right, pixels["megapixels"], pixels["curves"], "p")
     right.set_title(f"More pixels, {pixels['count']:,} Gaussians")
     right.set_xlabel("megapixels")
-    ticks = [0.02, 0.05, 0.1, 0.2, 0.5]
+    ticks = [0.01, 0.03, 0.1, 0.3]
     right.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     left.set_ylabel("processor time of one core, ms a picture")
     for axes in (left, right):
@@ -57,8 +56,8 @@ def _curves(axes: Axes, x: Sequence[float], curves: Mapping[str, Any], name: str
     axes.set_yscale("log")
     for key, curve in curves.items():
         label, colour, marker, style = LOOKS[key]
-        fit = Power(**curve["fit"])
-        text = f"{label}: {name}$^{{{fit.exponent:.2f}}}$"
+        fit = Growth(**curve["fit"])
+        text = f"{label}: {fit.fixed:.0f} ms + c {name}$^{{{fit.exponent:.2f}}}$"
         axes.plot(x, curve["ms"], color=colour, marker=marker, label=text, **style)
         along = np.geomspace(min(x), max(x), 50)
         axes.plot(along, fit.at(along), "--", color=colour, linewidth=1)

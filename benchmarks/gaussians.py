@@ -159,20 +159,22 @@ def by_pixels() -> dict[str, Any]:
 
 
 def grown(x: Any, cases: list[tuple[Street, Pinhole]], name: str) -> dict[str, Any]:
-    """Milliseconds of ours and of the peer in each case, and the fitted exponents."""
-    ms: dict[str, list[float]] = {FORWARD: [], BOTH: [], THEIRS: []}
-    for street, pinhole in cases:
+    """Milliseconds of ours and of the peer in each case, all in turns, and the fits."""
+    runs: dict[str, dict[int, Callable[[], object]]] = {FORWARD: {}, BOTH: {}, THEIRS: {}}
+    for index, (street, pinhole) in enumerate(cases):
         draw = partial(ours, pinhole=pinhole)
-        runs = {FORWARD: forward(street, draw), BOTH: both(street, draw)}
-        peer = {THEIRS: both(street, partial(theirs, pinhole=pinhole))}
-        for key, value in (interleaved(runs, ROUNDS) | interleaved(peer, 1)).items():
-            ms[key].append(value)
+        runs[FORWARD][index] = forward(street, draw)
+        runs[BOTH][index] = both(street, draw)
+        runs[THEIRS][index] = both(street, partial(theirs, pinhole=pinhole))
+    mine = {f"{key} {i}": run for key in (FORWARD, BOTH) for i, run in runs[key].items()}
+    peers = {f"{THEIRS} {i}": run for i, run in runs[THEIRS].items()}
+    ms = interleaved(mine, ROUNDS) | interleaved(peers, 1)
     curves = {}
-    for key, values in ms.items():
-        fit = fitted_power(x, values)
-        print(
-            f"  {key:34s}", " ".join(f"{v:9.1f}" for v in values), f"  ~ {name}^{fit.exponent:.2f}"
-        )
+    for key, cases_of_key in runs.items():
+        values = [ms[f"{key} {i}"] for i in cases_of_key]
+        fit = fitted_growth(x, values)
+        law = f"{fit.fixed:.0f} + c {name}^{fit.exponent:.2f}"
+        print(f"  {key:34s}", " ".join(f"{v:8.1f}" for v in values), f"  ~ {law}")
         curves[key] = {"ms": values, "fit": fit._asdict()}
     print(end="", flush=True)
     return curves

@@ -201,13 +201,13 @@ def test_the_rasterisers_peer_draws_the_same(kind, fragments):
     sure = ~wanted.doubtful
     for right, got in zip(wanted[:3], found, strict=True):
         # Its float32 determinant cancels for needles.
-        assert (right - got).detach().abs()[sure].max() <= 3e-4
+        assert (right - got).detach().abs()[sure].max() <= 5e-4
     weight = torch.randn(37, 53, 3, generator=torch.Generator().manual_seed(0)) * sure[..., None]
     (wanted.colours * weight).sum().backward()
     (found[0] * weight).sum().backward()
     for name in LEAVES:
         right, got = getattr(exact, name).grad, getattr(single, name).grad
-        assert (right - got).norm() <= 1e-4 * right.norm(), name
+        assert (right - got).norm() <= 5e-4 * right.norm(), name
 
 
 def test_the_street_of_gaussians_is_covered():

@@ -10,6 +10,15 @@ from oracles.gaussian_checks import PLANES, check_gradients, check_picture, expe
 from oracles.random_gaussians import LEAVES, case
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Torch's own threads cost more than they bring on pictures of this size."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
 def _unlike(**values):
     def plant(patch):
         for name, value in values.items():
@@ -81,6 +90,67 @@ def test_faults_are_found(name, check, monkeypatch):
     plant(monkeypatch)
     with pytest.raises(AssertionError, match="off by"):
         check(made)
+
+
+def _through(name):
+    """The value as it is, the gradient as if the function of that name were not there."""
+
+    def plant(patch):
+        right = getattr(reference, name)
+
+        def wrong(value, *args):
+            made = right(value, *args)
+            if isinstance(made, tuple):
+                return value + (made[0] - value).detach(), made[1]
+            return value + (made - value).detach()
+
+        patch.setattr(reference, name, wrong)
+
+    return plant
+
+
+def _held(name):
+    """The value as it is, without a gradient."""
+
+    def plant(patch):
+        right = getattr(reference, name)
+        patch.setattr(reference, name, lambda value: right(value).detach())
+
+    return plant
+
+
+def _length_held(patch):
+    patch.setattr(
+        reference, "normalised", lambda values: values / values.norm(dim=-1, keepdim=True).detach()
+    )
+
+
+def _depth_held(patch):
+    right = reference.projected
+
+    def wrong(*args):
+        splats = right(*args)
+        return splats._replace(z=splats.z.detach())
+
+    patch.setattr(reference, "projected", wrong)
+
+
+GRADIENT_FAULTS = {
+    "through the Jacobian's clamp": ("off-axis", _through("clamped")),
+    "through the cap": ("capped", _through("capped")),
+    "compensation held": ("mixed", _held("compensation")),
+    "length of a quaternion held": ("mixed", _length_held),
+    "depth held": ("mixed", _depth_held),
+}
+
+
+@pytest.mark.parametrize("name", GRADIENT_FAULTS)
+def test_faults_of_the_gradients_alone_are_found(name, monkeypatch):
+    kind, plant = GRADIENT_FAULTS[name]
+    plant(monkeypatch)
+    check_picture(case(kind, 0))
+    with pytest.raises(AssertionError, match=r"gradient of .* is off by"):
+        check_gradients(case(kind, 0))
 
 
 def test_the_reference_is_a_plain_walk_along_each_ray():

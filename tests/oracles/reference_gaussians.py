@@ -129,7 +129,7 @@ def projected(
     at_floor = torch.zeros_like(at_edge_x)
     opacity = opacities[order]
     if antialiased:
-        opacity = opacity * share.clamp(min=LEAST_COMPENSATION**2).sqrt()
+        opacity = opacity * compensation(share)
         at_floor = (share / LEAST_COMPENSATION**2 - 1).abs() < 1e-3
     return Splats(order, z, centre, soft, opacity, at_edge_x | at_edge_y | at_floor)
 
@@ -173,10 +173,19 @@ def alphas(splats, height, width):
     offset = torch.stack([u, v], dim=-1) - splats.centre[:, None, None]
     power = torch.einsum("nhwi,nij,nhwj->nhw", offset, torch.linalg.inv(splats.covariance), offset)
     raw = splats.opacity[:, None, None] * torch.exp(-0.5 * power)
-    alpha = raw.clamp(max=MOST_ALPHA)
+    alpha = capped(raw)
     doubtful = ((raw / LEAST_ALPHA - 1).abs() < DOUBT) | ((raw / MOST_ALPHA - 1).abs() < DOUBT)
     alpha = torch.where(alpha >= LEAST_ALPHA, alpha, 0.0)
     return alpha, doubtful | (splats.doubtful[:, None, None] & (alpha > 0))
+
+
+def compensation(share):
+    """What a splat's opacity is multiplied by: how much of its area is its own."""
+    return share.clamp(min=LEAST_COMPENSATION**2).sqrt()
+
+
+def capped(alpha):
+    return alpha.clamp(max=MOST_ALPHA)
 
 
 def swapped(splats, alpha):

@@ -8,7 +8,7 @@ from weather_aug.gaussians.rasterise import rasterise
 
 FORWARD, GRADIENT = 1e-4, 1e-4
 PLANES = ("colours", "opacity", "depth_m")
-MOST_DOUBTFUL = 0.02
+MOST_DOUBTFUL = 0.05
 """Of the pixels: where a threshold is so near that float32 may decide otherwise."""
 
 
@@ -45,7 +45,7 @@ def check_picture(case):
     """Our picture is the reference's."""
     wanted, found = expected(case.in_type(torch.float64, False)), ours(case)
     sure = ~wanted.doubtful
-    assert wanted.doubtful.sum() <= 1 + MOST_DOUBTFUL * sure.numel()
+    assert wanted.doubtful.sum() <= 3 + MOST_DOUBTFUL * sure.numel()
     for name in PLANES:
         plane = getattr(found, name)
         assert plane.dtype == torch.float32

@@ -52,7 +52,7 @@ def psnr_db(street: Reconstruction, frames: list[Frame], style: str = "snow") ->
 
 def test_a_known_recolouring_comes_back():
     assert psnr_db(replace(PAINTED, styles={"snow": own_style()}), SNOWED) < 15
-    assert psnr_db(fitted(), SNOWED) >= 40
+    assert psnr_db(fitted(), SNOWED) >= 35
 
 
 def own_style():

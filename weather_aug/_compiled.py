@@ -42,6 +42,15 @@ def inlined(function: Callable[..., Any]) -> Any:
     return _cached(numba.njit(nogil=True, error_model="numpy", forceinline=True)(function))
 
 
+def reassociated(function: Callable[..., Any]) -> Any:
+    """Compile `function` so that sums may be taken in any order: for gradients only.
+
+    On one machine its bits are the same each time; another may add in another order.
+    """
+    flags = {"reassoc", "nsz", "contract"}
+    return _cached(numba.njit(nogil=True, error_model="numpy", fastmath=flags)(function))
+
+
 def _cached(dispatcher: Any) -> Any:
     # No folder can be written: every process compiles for itself.
     with contextlib.suppress(RuntimeError):

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
+from weather_aug.errors import ArgumentError
 from weather_aug.gaussians.types import Pinhole
 
 NEAR_M = 0.1
+BACKENDS = ("auto", "cpu", "gsplat")
 
 
 class Drawn(NamedTuple):
-    """A picture of Gaussians; every field carries gradients."""
+    """A picture of Gaussians; all but `radii_px` carry gradients."""
 
     colours: Tensor
     """(H, W, C), over the background."""
@@ -45,7 +48,7 @@ def rasterise(
 
     Args:
         means_m: (N, 3) float32.
-        quaternions: (N, 4) (w, x, y, z), of any length.
+        quaternions: (N, 4) (w, x, y, z), of any length but zero.
         scales_m: (N, 3) standard deviations, positive (activated).
         opacities: (N,) in 0..1 (activated).
         colours: (N, C), any C ≥ 1: what is blended (RGB, class scores, …).
@@ -63,5 +66,46 @@ def rasterise(
     Raises:
         ArgumentError: If shapes, types or devices disagree.
         MissingExtraError: If CUDA tensors are given and gsplat is not installed.
+
+    Sources:
+        3DGS (Kerbl et al. 2023); constants of gsplat 1.6: dilation 0.3 px², alpha from 1/255 to
+        0.99, stop at 1e-4 of the light. (gsplat 1.5 caps alpha at 0.999 instead.)
     """
-    raise NotImplementedError
+    count = len(means_m)
+    _check("means_m", means_m, (count, 3), means_m)
+    _check("quaternions", quaternions, (count, 4), means_m)
+    _check("scales_m", scales_m, (count, 3), means_m)
+    _check("opacities", opacities, (count,), means_m)
+    _check("colours", colours, (count, colours.shape[-1]), means_m)
+    _check("camera_from_world", camera_from_world, (4, 4), means_m)
+    if backend not in BACKENDS:
+        raise ArgumentError(f"backend {backend!r} is not one of {', '.join(BACKENDS)}")
+    if not colours.shape[-1] > 0:
+        raise ArgumentError("colours must have at least one channel")
+    if backend == "gsplat" or (backend == "auto" and means_m.is_cuda):
+        from weather_aug.gaussians.rasterise_cuda import drawn
+    else:
+        from weather_aug.gaussians.rasterise_cpu import drawn
+    blended, opacity, depth_sum, centres, radii = drawn(
+        (means_m, quaternions, scales_m, opacities, colours, camera_from_world),
+        pinhole,
+        antialiased=antialiased,
+        near_m=near_m,
+        threads=threads,
+    )
+    if background is not None:
+        blended = blended + (1.0 - opacity)[..., None] * background
+    depth_m = depth_sum / opacity.clamp_min(_LEAST_OPACITY)
+    return Drawn(blended, opacity, depth_m, centres, radii)
+
+
+_LEAST_OPACITY = 1e-8
+
+
+def _check(name: str, value: Tensor, shape: tuple[int, ...], like: Tensor) -> None:
+    if tuple(value.shape) != shape:
+        raise ArgumentError(f"{name} must have shape {shape}, got {tuple(value.shape)}")
+    if value.dtype != torch.float32:
+        raise ArgumentError(f"{name} must be float32, got {value.dtype}")
+    if value.device != like.device:
+        raise ArgumentError(f"{name} is on {value.device}, means_m on {like.device}")

@@ -1,0 +1,449 @@
+"""A scene in a browser: its Gaussians, the recorded cameras, and weather that falls while one looks.
+
+Convention:
+    The server holds the scene; what falls is computed for each browser's own camera, ten times a
+    second, from the same particle field as `render`'s. One clock runs for everybody: particles
+    follow it without end, the recorded drive (what moves in it) begins anew when it is over. A
+    browser draws a preview, not `render`'s picture: see `weather_aug.view.splats` for what it
+    cannot do, and it knows fog as a linear fade only.
+"""
+
+from __future__ import annotations
+
+import math
+import socket
+import threading
+import time
+from types import TracebackType
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from weather_aug._extras import require
+from weather_aug._keys import check_seed
+from weather_aug.clip.types import Camera, FrameKey
+from weather_aug.colour import srgb_from_linear
+from weather_aug.errors import ArgumentError, printable
+from weather_aug.gaussians.gather import sky_of
+from weather_aug.gaussians.rotations import quaternions_of
+from weather_aug.scene.policy import TYPES, weather_of
+from weather_aug.scene.scene import WeatherScene
+from weather_aug.severity import parse_severity
+from weather_aug.view import splats
+from weather_aug.weather import Weather
+
+RATE_HZ = 10.0
+"""How often particles and actors are placed anew."""
+MOST_PARTICLES = 4000
+CAPACITY = MOST_PARTICLES + 1000
+"""The expected number is bounded, not the number: it scatters, and a browser has a fixed room."""
+PARTICLES_PER_M = 100.0
+"""Particles are sent in centimetres: as square metres their covariances would be 0 in float16."""
+EMPHASIS = 3.0
+MOST_FRUSTUMS = 120
+MOST_POINTS = 300_000
+THUMBNAIL_PX = 192
+LEAST_SPAN_S = 10.0
+"""Of the time's slider, for a clip of a single moment."""
+SKY_M = 4000.0
+CLIP_M = (0.05, 12_000.0)
+"""Nearest and farthest that a browser draws."""
+LOOK_AHEAD_M = 15.0
+"""Around what a browser's camera turns."""
+
+
+def open_viewer(
+    scene: WeatherScene,
+    *,
+    weather: str = "snow",
+    severity: float | str = "heavy",
+    seed: int = 0,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+) -> Viewer:
+    """Serve a scene to browsers until `Viewer.stop`.
+
+    Args:
+        scene: With its reconstruction; without, the points of the frames' depth are shown.
+        weather: Type to begin with: clear, rain, snow or fog.
+        severity: In [0, 1] or a name (light, moderate, heavy, extreme).
+        seed: Which particles fall and which gusts blow.
+        host: Address to listen on. Whoever reaches it sees the scene: keep the loopback's, and use
+            an SSH tunnel from elsewhere.
+        port: In 0..65535; 0 is any free one. Where it is taken, the next free one is used.
+
+    Raises:
+        MissingExtraError: If viser is not installed.
+        ArgumentError: If an argument is outside what is accepted, or nobody can listen on `host`.
+    """
+    viser = require("viser", extra="view", to="show a scene in a browser")
+    if weather not in TYPES:
+        raise ArgumentError(
+            f"weather type {printable(weather)!r} is not one of {', '.join(TYPES)}"
+        )
+    start = parse_severity(severity)
+    check_seed("seed", seed)
+    if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port <= 65535:
+        raise ArgumentError(f"port must be an integer in 0..65535, got {printable(port)}")
+    _check_host(host)
+    server = viser.ViserServer(host=host, port=port, label=scene.name, verbose=False)
+    try:
+        return Viewer(server, scene, weather, start, seed)
+    except BaseException:
+        server.stop()
+        raise
+
+
+class Viewer:
+    """A server that shows one scene; made by `open_viewer`. Also a context manager that stops."""
+
+    def __init__(
+        self, server: Any, scene: WeatherScene, kind: str, severity: float, seed: int
+    ) -> None:
+        """Use `open_viewer`."""
+        self.server = server
+        self._street = _Street(server, scene)
+        self._controls = _Controls(server, self._street, kind, severity, seed)
+        self._falling: dict[int, Any] = {}
+        self._clock_s = 0.0
+        self._error: BaseException | None = None
+        self._stopping, self._stopped = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="weather-aug view", daemon=True)
+        self._thread.start()
+
+    @property
+    def address(self) -> str:
+        """URL to open."""
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+
+    def stop(self) -> None:
+        """Close the server and its browsers' connections; twice does no harm."""
+        self._stopping.set()
+        self._thread.join()
+        if not self._stopped.is_set():
+            self._stopped.set()
+            self.server.stop()
+
+    def wait(self) -> None:
+        """Return when the viewer has stopped; raise what has stopped it, if it was an error."""
+        while self._thread.is_alive():
+            self._thread.join(0.5)
+        if self._error is not None:
+            raise self._error
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+    def _run(self) -> None:
+        try:
+            before = time.monotonic()
+            while not self._stopping.wait(1 / RATE_HZ):
+                now = time.monotonic()
+                self._show(now - before)
+                before = now
+        except BaseException as error:
+            # A thread's error would be printed and forgotten; `wait` hands it on.
+            self._error = error
+
+    def _show(self, elapsed_s: float) -> None:
+        """Let the clock run on, and show what has changed."""
+        controls, street = self._controls, self._street
+        self._clock_s = controls.moved_s(self._clock_s, elapsed_s)
+        drive_s = self._clock_s % street.span_s
+        controls.show_time(drive_s)
+        weather = controls.weather
+        street.show_weather(weather, controls.kind.value, float(controls.severity.value))
+        street.show_parts(controls)
+        street.show_actors(drive_s, controls.hidden_tracks)
+        clients = self.server.get_clients()
+        self._falling = {name: h for name, h in self._falling.items() if name in clients}
+        for name, client in clients.items():
+            self._show_falling(name, client, weather)
+
+    def _show_falling(self, name: int, client: Any, weather: Weather) -> None:
+        controls, street = self._controls, self._street
+        if name in self._falling:
+            self._falling[name].visible = controls.particles.value
+        if not controls.particles.value or not client.camera.image_height:
+            return
+        camera = client.camera
+        view = splats.browser_camera(
+            camera.position,
+            camera.wxyz,
+            camera.fov,
+            (camera.image_width, camera.image_height),
+            street.camera,
+        )
+        found = splats.particle_splats(
+            view,
+            self._clock_s,
+            weather,
+            int(controls.seed.value),
+            street.light,
+            shelter=street.scene.shelter,
+            max_particles=MOST_PARTICLES,
+            emphasis=float(controls.emphasis.value),
+        ).padded(CAPACITY)
+        arrays = found._replace(
+            centres_m=found.centres_m * np.float32(PARTICLES_PER_M),
+            covariances_m2=found.covariances_m2 * np.float32(PARTICLES_PER_M**2),
+        )
+        if name in self._falling:
+            self._falling[name].set_gaussians(*arrays)
+        else:
+            self._falling[name] = client.scene.add_gaussian_splats(
+                "/particles", *arrays, scale=1 / PARTICLES_PER_M
+            )
+
+
+class _Street:
+    """What stands in the browser besides what falls."""
+
+    def __init__(self, server: Any, scene: WeatherScene) -> None:
+        self.server, self.scene = server, scene
+        self.reconstruction = scene.reconstruction
+        records = scene.manifest.frames
+        self.first_s = records[0].time_s
+        self.span_s = max(max(r.time_s for r in records) - self.first_s, LEAST_SPAN_S)
+        cameras = {} if self.reconstruction is None else self.reconstruction.cameras
+        self._cameras = {r.key: cameras.get(r.key, r.camera) for r in records}
+        self._seen_s = {r.key: r.time_s for r in records}
+        start = records[len(records) // 2].key
+        self.camera: Camera = self._cameras[start]
+        self.light = scene.ambience(start)
+        self._actors: Any = None
+        self._alone = None
+        self._wanted: tuple[str | None, float] = (None, 0.0)
+        self._styled = self._wanted
+        self._fog: tuple[float | None, int] = (None, 0)
+        self._look_from(self.camera)
+        self._frustums = self._add_cameras()
+        self._background = self._add_background()
+        self._sky = self._add_sky()
+        self._add_actors()
+
+    @property
+    def parts(self) -> dict[str, list[Any]]:
+        """What can be hidden, by its name."""
+        named = {"scene": [self._background], "sky": self._sky, "cameras": self._frustums}
+        return {name: [h for h in handles if h is not None] for name, handles in named.items()}
+
+    @property
+    def tracks(self) -> dict[int, str]:
+        """Class names by track, of what moves."""
+        actors = () if self.reconstruction is None else self.reconstruction.actors
+        return {actor.track_id: actor.class_name for actor in actors}
+
+    def show_parts(self, controls: _Controls) -> None:
+        """Hide what is not ticked."""
+        for name, handles in self.parts.items():
+            for handle in handles:
+                handle.visible = bool(controls.parts[name].value)
+
+    def show_actors(self, drive_s: float, hidden: set[int]) -> None:
+        """Put what moves where it is at a time of the drive."""
+        if self._alone is None:
+            return
+        time_s = self.first_s + drive_s
+        nearest = min(self._seen_s, key=lambda key: abs(self._seen_s[key] - time_s))
+        style, amount = self._styled
+        found = splats.actor_splats(
+            self._alone, time_s, self._cameras[nearest].centre_world, style, amount, hidden
+        ).padded(len(self._alone.actor_gaussians))
+        if self._actors is None:
+            self._actors = self.server.scene.add_gaussian_splats("/actors", *found)
+        else:
+            self._actors.set_gaussians(*found)
+
+    def show_weather(self, weather: Weather, kind: str, severity: float) -> None:
+        """Colours of the weather's style where there is one, and its fog."""
+        styles = {} if self.reconstruction is None else self.reconstruction.styles
+        wanted = (kind, severity) if kind in styles else (None, 0.0)
+        # All colours are sent anew: not before the slider rests.
+        if wanted == self._wanted and wanted != self._styled:
+            self._styled = wanted
+            self._show_style(*wanted)
+        self._wanted = wanted
+        end_m = splats.fog_end_m(weather)
+        level = srgb_from_linear(np.clip(self.light.under(weather.overcast).airlight, 0, 1))
+        colour = tuple(splats.levels(level).tolist())
+        fog = (end_m, hash(colour))
+        if fog != self._fog:
+            self._fog = fog
+            self.server.scene.configure_fog(
+                0.0, end_m or CLIP_M[1], color=colour, enabled=end_m is not None
+            )
+
+    def _show_style(self, style: str | None, amount: float) -> None:
+        assert self.reconstruction is not None
+        cameras = list(self._cameras.values())
+        found = splats.background_splats(self.reconstruction, cameras, style, amount)
+        self._background.set_gaussians(*found)
+        for handle, face in zip(
+            self._sky, sky_of(self.reconstruction, style, amount).faces, strict=True
+        ):
+            handle.image = splats.levels(face)
+
+    def _look_from(self, camera: Camera) -> None:
+        """Where a new browser's camera is."""
+        up = self.scene.manifest.axes_world[2]
+        self.server.scene.set_up_direction(up)
+        start = self.server.initial_camera
+        start.position = camera.centre_world
+        start.look_at = camera.centre_world + LOOK_AHEAD_M * camera.world_from_camera[:3, 2]
+        start.up = up
+        start.fov = _vertical_fov_rad(camera)
+        start.near, start.far = CLIP_M
+
+    def _add_cameras(self) -> list[Any]:
+        """Frustums with their pictures; a click looks from there. The lens's middle is left out."""
+        keys = splats.spread(list(self._cameras), MOST_FRUSTUMS)
+        return [self._add_camera(key) for key in keys]
+
+    def _add_camera(self, key: FrameKey) -> Any:
+        camera = self._cameras[key]
+        wxyz = quaternions_of(camera.world_from_camera[:3, :3])
+        frustum = self.server.scene.add_camera_frustum(
+            f"/cameras/{key}",
+            _vertical_fov_rad(camera),
+            camera.width / camera.height,
+            scale=0.25,
+            thickness=0.005,
+            color=(230, 120, 30),
+            image=_thumbnail(self.scene.frame(key).image),
+            wxyz=wxyz,
+            position=camera.centre_world,
+            visible=False,
+        )
+
+        @frustum.on_click  # type: ignore[untyped-decorator]
+        def _(event: Any) -> None:
+            with event.client.atomic():
+                event.client.camera.position = camera.centre_world
+                event.client.camera.look_at = (
+                    camera.centre_world + LOOK_AHEAD_M * camera.world_from_camera[:3, 2]
+                )
+
+        return frustum
+
+    def _add_background(self) -> Any:
+        if self.reconstruction is not None:
+            found = splats.background_splats(self.reconstruction, list(self._cameras.values()))
+            return self.server.scene.add_gaussian_splats("/scene", *found)
+        keys = splats.spread(self.scene.keys, MOST_FRUSTUMS)
+        pixels = sum(math.prod(self.scene.size_of(key)) for key in keys)
+        step_px = max(1, math.ceil(math.sqrt(pixels / MOST_POINTS)))
+        clouds = [splats.depth_points(self.scene.frame(key), step_px) for key in keys]
+        points, colours = (np.concatenate(arrays) for arrays in zip(*clouds, strict=True))
+        return self.server.scene.add_point_cloud(
+            "/scene",
+            points,
+            colours,
+            point_size=0.04,
+            point_shape="circle",
+            point_shading="flat",
+            precision="float32",
+        )
+
+    def _add_sky(self) -> list[Any]:
+        if self.reconstruction is None:
+            return []
+        return [
+            self.server.scene.add_image(
+                f"/sky/{face}",
+                splats.levels(picture),
+                2 * SKY_M,
+                2 * SKY_M,
+                wxyz=splats.sky_face_wxyz(face),
+                position=self.camera.centre_world + SKY_M * splats.sky_face_direction(face),
+            )
+            for face, picture in enumerate(self.reconstruction.sky.faces)
+        ]
+
+    def _add_actors(self) -> None:
+        if self.reconstruction is not None and len(self.reconstruction.actor_gaussians):
+            self._alone = splats.actors_alone(self.reconstruction)
+            self.show_actors(0.0, set())
+
+
+class _Controls:
+    """What people set."""
+
+    def __init__(
+        self, server: Any, street: _Street, kind: str, severity: float, seed: int
+    ) -> None:
+        gui = server.gui
+        with gui.add_folder("weather"):
+            self.kind = gui.add_dropdown("type", tuple(TYPES), initial_value=kind)
+            self.severity = gui.add_slider("severity", 0.0, 1.0, 0.01, severity)
+            self.seed = gui.add_number("seed", seed, step=1)
+            self.emphasis = gui.add_slider(
+                "emphasis", 1.0, 10.0, 0.5, EMPHASIS, hint="Factor on the opacity of particles"
+            )
+        with gui.add_folder("time"):
+            self._time = gui.add_slider("second", 0.0, street.span_s, 0.01, 0.0)
+            self._pause = gui.add_checkbox("pause", False)
+        with gui.add_folder("show"):
+            self.particles = gui.add_checkbox("particles", True)
+            self.parts = {
+                name: gui.add_checkbox(name, name != "cameras") for name in street.parts
+            }
+        self._tracks = {}
+        if street.tracks:
+            with gui.add_folder("moving"):
+                self._tracks = {
+                    track: gui.add_checkbox(f"{name} {track}", True)
+                    for track, name in street.tracks.items()
+                }
+        self._shown_s = 0.0
+
+    @property
+    def weather(self) -> Weather:
+        """As set now."""
+        return weather_of(self.kind.value, min(max(float(self.severity.value), 0.0), 1.0))
+
+    @property
+    def hidden_tracks(self) -> set[int]:
+        """Of what moves."""
+        return {track for track, box in self._tracks.items() if not box.value}
+
+    def moved_s(self, clock_s: float, elapsed_s: float) -> float:
+        """The clock after some time, or where somebody has put it."""
+        if self._time.value != self._shown_s:
+            return float(self._time.value)
+        return clock_s if self._pause.value else clock_s + elapsed_s
+
+    def show_time(self, drive_s: float) -> None:
+        """Put the slider where the clock is."""
+        self._shown_s = round(drive_s, 2)
+        self._time.value = self._shown_s
+
+
+def _vertical_fov_rad(camera: Camera) -> float:
+    return 2 * math.atan(0.5 * camera.height / camera.focal_px[1])
+
+
+def _thumbnail(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height, width = image.shape[:2]
+    size = (THUMBNAIL_PX, max(1, round(height * THUMBNAIL_PX / width)))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _check_host(host: str) -> None:
+    try:
+        socket.create_server((host, 0)).close()
+    except OSError as error:
+        raise ArgumentError(
+            f"cannot listen on host {printable(host)!r}: {error.strerror or error}; 127.0.0.1 is "
+            "this machine alone"
+        ) from None

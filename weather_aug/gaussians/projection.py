@@ -89,11 +89,16 @@ def _covariance(flat):
 
 
 @compiled
-def project(means, quaternions, scales, opacities, view, lens, near, antialiased, parts, depths, radii):
+def project(
+    means, quaternions, scales, opacities, view, lens, near, antialiased, parts, depths, radii
+):
     """Fill `parts` (N, 6), `depths` and `radii` (N,); a radius of 0 is not drawn.
 
     Args:
-        means: (N, 3), and so on as in `rasterise`.
+        means: (N, 3).
+        quaternions: (N, 4).
+        scales: (N, 3).
+        opacities: (N,).
         view: (4, 4) float64, camera from world.
         lens: fx, fy, cx, cy, and the limits of -x/z, x/z, -y/z, y/z for the Jacobian.
         near: Nearest z, metres.
@@ -256,9 +261,7 @@ def _quaternion_back(quaternion, length, d_rotation, row):
     w, x = float(quaternion[0]) / length, float(quaternion[1]) / length
     y, z = float(quaternion[2]) / length, float(quaternion[3]) / length
     d = d_rotation
-    d_w = 2.0 * (
-        x * (d[2, 1] - d[1, 2]) + y * (d[0, 2] - d[2, 0]) + z * (d[1, 0] - d[0, 1])
-    )
+    d_w = 2.0 * (x * (d[2, 1] - d[1, 2]) + y * (d[0, 2] - d[2, 0]) + z * (d[1, 0] - d[0, 1]))
     d_x = 2.0 * (
         w * (d[2, 1] - d[1, 2])
         + y * (d[0, 1] + d[1, 0])

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -486,3 +487,22 @@ def test_compressed_and_back_within_its_steps(tmp_path: Path, splat_transform: T
     assert np.abs(opacity - expected).max() < 1 / 255
     assert np.abs(back.sh[order, 0] - gaussians.sh[:, 0]).max() < 0.02
     assert np.abs(back.sh[order, 1:] - gaussians.sh[:, 1:]).max() < 8 / 256
+
+
+def test_the_five_lines_for_drivestudio_convert(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The block of docs/gaussian_files.md, on a checkpoint with the names of its table."""
+    gaussians = cloud(20, 4)
+    names = "_means _quats _scales _features_dc _features_rest".split()
+    arrays = [getattr(gaussians, name) for name in ARRAYS[:3]]
+    state = dict(zip(names, [*arrays, gaussians.sh[:, 0], gaussians.sh[:, 1:]], strict=True))
+    state["_opacities"] = gaussians.logit_opacities[:, None]
+    tensors = {name: torch.from_numpy(array) for name, array in state.items()}
+    monkeypatch.chdir(tmp_path)
+    torch.save({"models": {"Background": tensors}, "step": 30000}, "checkpoint_final.pth")
+    page = Path(files.__file__).parents[2] / "docs" / "gaussian_files.md"
+    blocks = page.read_text(encoding="utf-8").split("```python\n")[1:]
+    (block,) = [text.split("```")[0] for text in blocks if "checkpoint_final" in text]
+    exec(block, {"torch": torch, "np": np, "Gaussians": Gaussians, "write_ply": write_ply})
+    assert_same_bits(gaussians, read_ply("background.ply"))

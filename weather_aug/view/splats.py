@@ -71,12 +71,9 @@ class Splats(NamedTuple):
 
         A browser updates as many splats as it had in place, and any other number anew.
         """
-        missing = count - len(self.centres_m)
-        if missing <= 0:
-            return Splats(*(array[:count] for array in self))
-        return Splats(
-            *(np.pad(a, [(0, missing)] + [(0, 0)] * (a.ndim - 1)) for a in self)  # type: ignore[arg-type]
-        )
+        kept = Splats._make(array[:count] for array in self)
+        missing = max(count - len(self.centres_m), 0)
+        return Splats._make(np.pad(a, [(0, missing)] + [(0, 0)] * (a.ndim - 1)) for a in kept)
 
 
 def covariances_of(quaternions: Float32, scales_m: Float32) -> Float32:
@@ -235,7 +232,7 @@ def particle_splats(
         found = exposed(found, view, field.air.wind_m_per_s, shelter)
         colour = srgb_from_linear(np.clip(particle_colour(field.population.kind, sky), 0.0, 1.0))
         parts.append(_smeared(found, view, levels(colour), emphasis))
-    return Splats(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))  # type: ignore[arg-type]
+    return Splats._make(np.concatenate(arrays) for arrays in zip(*parts, strict=True))
 
 
 def _smeared(particles: Float32, view: Camera, rgb: UInt8, emphasis: float) -> Splats:

@@ -1,4 +1,4 @@
-"""A scene in a browser: its Gaussians, the recorded cameras, and weather that falls while one looks.
+"""A scene in a browser: its Gaussians, the recorded cameras, and weather that falls meanwhile.
 
 Convention:
     The server holds the scene; what falls is computed for each browser's own camera, ten times a
@@ -28,6 +28,7 @@ from weather_aug.colour import srgb_from_linear
 from weather_aug.errors import ArgumentError, printable
 from weather_aug.gaussians.gather import sky_of
 from weather_aug.gaussians.rotations import quaternions_of
+from weather_aug.gaussians.types import Reconstruction
 from weather_aug.scene.policy import TYPES, weather_of
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.severity import parse_severity
@@ -37,8 +38,8 @@ from weather_aug.weather import Weather
 RATE_HZ = 10.0
 """How often particles and actors are placed anew."""
 MOST_PARTICLES = 4000
-CAPACITY = MOST_PARTICLES + 1000
-"""The expected number is bounded, not the number: it scatters, and a browser has a fixed room."""
+CAPACITY = 3 * MOST_PARTICLES // 2
+"""Some are just outside the picture, and their number scatters; a browser's room is fixed."""
 PARTICLES_PER_M = 100.0
 """Particles are sent in centimetres: as square metres their covariances would be 0 in float16."""
 EMPHASIS = 3.0
@@ -80,9 +81,7 @@ def open_viewer(
     """
     viser = require("viser", extra="view", to="show a scene in a browser")
     if weather not in TYPES:
-        raise ArgumentError(
-            f"weather type {printable(weather)!r} is not one of {', '.join(TYPES)}"
-        )
+        raise ArgumentError(f"weather type {printable(weather)!r} is not one of {', '.join(TYPES)}")
     start = parse_severity(severity)
     check_seed("seed", seed)
     if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port <= 65535:
@@ -218,14 +217,16 @@ class _Street:
         cameras = {} if self.reconstruction is None else self.reconstruction.cameras
         self._cameras = {r.key: cameras.get(r.key, r.camera) for r in records}
         self._seen_s = {r.key: r.time_s for r in records}
-        start = records[len(records) // 2].key
+        front = [r.key for r in records if r.key.camera == records[0].key.camera]
+        start = front[len(front) // 2]
         self.camera: Camera = self._cameras[start]
         self.light = scene.ambience(start)
         self._actors: Any = None
-        self._alone = None
+        self._alone: Reconstruction | None = None
+        self._moment: tuple[object, ...] = ()
         self._wanted: tuple[str | None, float] = (None, 0.0)
-        self._styled = self._wanted
-        self._fog: tuple[float | None, int] = (None, 0)
+        self._styled: tuple[str | None, float] = self._wanted
+        self._fog: tuple[object, ...] = (None,)
         self._look_from(self.camera)
         self._frustums = self._add_cameras()
         self._background = self._add_background()
@@ -236,7 +237,7 @@ class _Street:
     def parts(self) -> dict[str, list[Any]]:
         """What can be hidden, by its name."""
         named = {"scene": [self._background], "sky": self._sky, "cameras": self._frustums}
-        return {name: [h for h in handles if h is not None] for name, handles in named.items()}
+        return {name: handles for name, handles in named.items() if handles}
 
     @property
     def tracks(self) -> dict[int, str]:
@@ -252,8 +253,10 @@ class _Street:
 
     def show_actors(self, drive_s: float, hidden: set[int]) -> None:
         """Put what moves where it is at a time of the drive."""
-        if self._alone is None:
+        moment = (drive_s, frozenset(hidden), *self._styled)
+        if self._alone is None or moment == self._moment:
             return
+        self._moment = moment
         time_s = self.first_s + drive_s
         nearest = min(self._seen_s, key=lambda key: abs(self._seen_s[key] - time_s))
         style, amount = self._styled
@@ -268,7 +271,7 @@ class _Street:
     def show_weather(self, weather: Weather, kind: str, severity: float) -> None:
         """Colours of the weather's style where there is one, and its fog."""
         styles = {} if self.reconstruction is None else self.reconstruction.styles
-        wanted = (kind, severity) if kind in styles else (None, 0.0)
+        wanted: tuple[str | None, float] = (kind, severity) if kind in styles else (None, 0.0)
         # All colours are sent anew: not before the slider rests.
         if wanted == self._wanted and wanted != self._styled:
             self._styled = wanted
@@ -277,7 +280,7 @@ class _Street:
         end_m = splats.fog_end_m(weather)
         level = srgb_from_linear(np.clip(self.light.under(weather.overcast).airlight, 0, 1))
         colour = tuple(splats.levels(level).tolist())
-        fog = (end_m, hash(colour))
+        fog = (end_m,) if end_m is None else (end_m, colour)
         if fog != self._fog:
             self._fog = fog
             self.server.scene.configure_fog(
@@ -326,7 +329,7 @@ class _Street:
             visible=False,
         )
 
-        @frustum.on_click  # type: ignore[untyped-decorator]
+        @frustum.on_click
         def _(event: Any) -> None:
             with event.client.atomic():
                 event.client.camera.position = camera.centre_world
@@ -356,7 +359,10 @@ class _Street:
         )
 
     def _add_sky(self) -> list[Any]:
+        """The cube map as six pictures far away; one colour behind everything if there is none."""
         if self.reconstruction is None:
+            colour = splats.levels(srgb_from_linear(np.clip(self.light.sky, 0, 1)))
+            self.server.scene.set_background_image(np.tile(colour, (4, 4, 1)))
             return []
         return [
             self.server.scene.add_image(
@@ -379,9 +385,7 @@ class _Street:
 class _Controls:
     """What people set."""
 
-    def __init__(
-        self, server: Any, street: _Street, kind: str, severity: float, seed: int
-    ) -> None:
+    def __init__(self, server: Any, street: _Street, kind: str, severity: float, seed: int) -> None:
         gui = server.gui
         with gui.add_folder("weather"):
             self.kind = gui.add_dropdown("type", tuple(TYPES), initial_value=kind)
@@ -395,9 +399,7 @@ class _Controls:
             self._pause = gui.add_checkbox("pause", False)
         with gui.add_folder("show"):
             self.particles = gui.add_checkbox("particles", True)
-            self.parts = {
-                name: gui.add_checkbox(name, name != "cameras") for name in street.parts
-            }
+            self.parts = {name: gui.add_checkbox(name, name != "cameras") for name in street.parts}
         self._tracks = {}
         if street.tracks:
             with gui.add_folder("moving"):

@@ -23,6 +23,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
+from plyfile import PlyData
 
 from weather_aug import _files
 from weather_aug.errors import ArgumentError, DataError, OutputError
@@ -175,6 +176,34 @@ def put(path: Path, lines: list[str], body: bytes, newline: str = "\n") -> Path:
 def names_of(coefficients: int) -> list[str]:
     rest = [f"f_rest_{k}" for k in range(3 * (coefficients - 1))]
     return [name for name in LAYOUT if not name.startswith("f_rest")] + rest
+
+
+def test_plyfile_reads_what_is_written_and_the_other_way_round(tmp_path: Path) -> None:
+    gaussians = cloud(40, classes=2)
+    write_ply(tmp_path / "a.ply", gaussians, with_classes=True)
+    data = PlyData.read(tmp_path / "a.ply")
+    assert (data.text, data.byte_order, len(data.elements)) == (False, "<", 1)
+    assert [p.name for p in data["vertex"].properties] == [*LAYOUT, "class_00", "class_01"]
+    assert (data["vertex"]["rot_0"] == gaussians.quaternions[:, 0]).all()
+    assert (data["vertex"]["f_rest_16"] == gaussians.sh[:, 2, 1]).all()
+    data.comments.append("by another")
+    data.write(tmp_path / "b.ply")
+    assert_same_bits(gaussians, read_ply(tmp_path / "b.ply"))
+
+
+@pytest.mark.parametrize("order", ["=", ">"])
+def test_the_cure_for_text_and_other_byte_orders_cures(tmp_path: Path, order: str) -> None:
+    gaussians = cloud(3, 4)
+    write_ply(tmp_path / "a.ply", gaussians)
+    data = PlyData.read(tmp_path / "a.ply", mmap=False)
+    data.text, data.byte_order = order == "=", order
+    data.write(tmp_path / "b.ply")
+    with pytest.raises(DataError, match="plyfile"):
+        read_ply(tmp_path / "b.ply")
+    p = PlyData.read(tmp_path / "b.ply")
+    p.text, p.byte_order = False, "<"
+    p.write(tmp_path / "c.ply")
+    assert read_ply(tmp_path / "c.ply").sh.shape == (3, 4, 3)
 
 
 @pytest.mark.parametrize("newline", ["\n", "\r\n"])

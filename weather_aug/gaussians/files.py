@@ -17,13 +17,12 @@ from __future__ import annotations
 import math
 import re
 import stat
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement, PlyParseError
 
 from weather_aug import _files
 from weather_aug.errors import ArgumentError, DataError, printable
@@ -48,6 +47,7 @@ _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATERNION = ("rot_0", "rot_1", "rot_2", "rot_3")
 _NEEDED = (*_MEANS, *_DC, "opacity", *_SCALES, *_QUATERNION)
+_OPENING = ("ply", "format binary_little_endian 1.0")
 _FLOATS = ("float", "float32")
 _CONVERT = "convert it with: splat-transform in.ply out.ply"
 
@@ -69,18 +69,21 @@ def write_ply(path: str | Path, gaussians: Gaussians, *, with_classes: bool = Fa
     problem = _unusable(gaussians)
     if problem:
         raise ArgumentError(f"cannot write these Gaussians: {problem}")
-    rows = np.zeros(len(gaussians), np.dtype([(name, "<f4") for name in columns]))
+    rows = np.empty(len(gaussians), _layout(columns))
     for name, values in columns.items():
         rows[name] = values
     with _files.whole_file(Path(path)) as file:
-        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(file)
+        lines = [*_OPENING, f"element vertex {len(rows)}"]
+        lines += [f"property float {name}" for name in columns]
+        file.write("\n".join([*lines, "end_header", ""]).encode("ascii"))
+        rows.tofile(file)
 
 
 def read_ply(path: str | Path, *, drop: Collection[str] = ()) -> Gaussians:
     """Read a 3DGS PLY of degree 0 to 3, with or without normals and class scores.
 
-    The header is checked against the size of the file before anything is allocated. The file must
-    not be cut short by somebody else meanwhile: it is mapped into memory.
+    The header is checked against the size of the file before anything is allocated, and nothing in
+    it is run.
 
     Args:
         path: File to read.
@@ -103,7 +106,7 @@ def read_ply(path: str | Path, *, drop: Collection[str] = ()) -> Gaussians:
             raise DataError(f"{where} is not a regular file")
         with path.open("rb") as file:
             header = _checked_header(file, where, drop)
-            rows = _rows(file, where, header.rows)
+            rows = _rows(file, where, header)
             gaussians = _gaussians(rows, header)
     except OSError as error:
         raise DataError(f"cannot read {where}: {error.strerror or error}") from None
@@ -114,7 +117,11 @@ def read_ply(path: str | Path, *, drop: Collection[str] = ()) -> Gaussians:
 
 
 class _Header(NamedTuple):
+    begin: int
+    """Of the rows, bytes."""
     rows: int
+    names: tuple[str, ...]
+    """Of all properties, in the order of the file."""
     coefficients: int
     classes: int
 
@@ -182,15 +189,17 @@ def _class_names(classes: int) -> tuple[str, ...]:
     return tuple(f"class_{k:02d}" for k in range(classes))
 
 
-def _rows(file: BinaryIO, where: str, count: int) -> NDArray[np.void]:
-    """The rows behind a header that was checked, mapped."""
-    file.seek(0)
-    try:
-        data = PlyData.read(file, mmap="r" if count else False)
-    except (PlyParseError, ValueError, MemoryError) as error:
-        raise DataError(f"{where} is not a PLY that plyfile reads: {printable(error)}") from None
-    rows: NDArray[np.void] = data["vertex"].data
+def _rows(file: BinaryIO, where: str, header: _Header) -> NDArray[np.void]:
+    """The rows behind a header that was checked."""
+    file.seek(header.begin)
+    rows = np.fromfile(file, _layout(header.names), header.rows)
+    if len(rows) != header.rows:
+        raise DataError(f"{where} was cut short while it was read; read it again")
     return rows
+
+
+def _layout(names: Iterable[str]) -> np.dtype[np.void]:
+    return np.dtype([(name, "<f4") for name in names])
 
 
 def _checked_header(file: BinaryIO, where: str, drop: Collection[str]) -> _Header:
@@ -199,14 +208,14 @@ def _checked_header(file: BinaryIO, where: str, drop: Collection[str]) -> _Heade
     file.seek(0)
     lines, begin = _header_lines(file.read(MAX_HEADER_BYTES), where)
     count, names = _declared(lines, where)
-    header = _known(count, [name for name in names if name not in drop], where)
+    coefficients, classes = _known([name for name in names if name not in drop], where)
     expected = begin + count * 4 * len(names)
     if expected != size:
         raise DataError(
             f"{where} declares {count} Gaussians of {len(names)} numbers, {expected} bytes in all, "
             f"but has {size}; it was cut short or is not what it says: copy or export it again"
         )
-    return header
+    return _Header(begin, count, names, coefficients, classes)
 
 
 def _header_lines(start: bytes, where: str) -> tuple[list[str], int]:
@@ -229,11 +238,11 @@ def _header_lines(start: bytes, where: str) -> tuple[list[str], int]:
 
 def _declared(lines: list[str], where: str) -> tuple[int, tuple[str, ...]]:
     """Number of rows and names of their properties; all are float32 and differ."""
-    if not lines or lines[0].split() != ["format", "binary_little_endian", "1.0"]:
+    if not lines or lines[0].split() != _OPENING[1].split():
         found = printable(lines[0] if lines else "")
         raise DataError(
             f"{where} must be of format binary_little_endian 1.0, got {found!r}; read it with "
-            "plyfile, set text = False and byte_order = '<', and write it again"
+            "the package plyfile, set text = False and byte_order = '<', and write it again"
         )
     counts: list[int] = []
     names: list[str] = []
@@ -259,8 +268,8 @@ def _declared(lines: list[str], where: str) -> tuple[int, tuple[str, ...]]:
     return counts[0], tuple(names)
 
 
-def _known(count: int, names: Sequence[str], where: str) -> _Header:
-    """The header of 3DGS that these properties make."""
+def _known(names: Sequence[str], where: str) -> tuple[int, int]:
+    """How many coefficients and classes these properties hold, if they are 3DGS."""
     missing = [name for name in _NEEDED if name not in names]
     if missing:
         raise DataError(
@@ -284,7 +293,7 @@ def _known(count: int, names: Sequence[str], where: str) -> _Header:
             f"{where} has properties that 3DGS does not know: {printable(', '.join(strange))}; "
             f"if they change nothing, read it with drop={printable(tuple(strange))}"
         )
-    return _Header(count, coefficients, classes)
+    return coefficients, classes
 
 
 def _unusable(gaussians: Gaussians) -> str | None:

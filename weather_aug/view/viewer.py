@@ -108,6 +108,8 @@ class Viewer:
         self._falling: dict[int, Any] = {}
         self._clock_s = 0.0
         self._error: BaseException | None = None
+        # The first particles compile their kernels; no browser should wait for that.
+        self._falling_around(self._street.camera, weather_of("snow", severity))
         self._stopping, self._stopped = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="weather-aug view", daemon=True)
         self._thread.start()
@@ -183,26 +185,30 @@ class Viewer:
             (camera.image_width, camera.image_height),
             street.camera,
         )
-        found = splats.particle_splats(
-            view,
-            self._clock_s,
-            weather,
-            int(controls.seed.value),
-            street.light,
-            shelter=street.scene.shelter,
-            max_particles=MOST_PARTICLES,
-            emphasis=float(controls.emphasis.value),
-        ).padded(CAPACITY)
-        arrays = found._replace(
-            centres_m=found.centres_m * np.float32(PARTICLES_PER_M),
-            covariances_m2=found.covariances_m2 * np.float32(PARTICLES_PER_M**2),
-        )
+        arrays = self._falling_around(view, weather)
         if name in self._falling:
             self._falling[name].set_gaussians(*arrays)
         else:
             self._falling[name] = client.scene.add_gaussian_splats(
                 "/particles", *arrays, scale=1 / PARTICLES_PER_M
             )
+
+    def _falling_around(self, view: Camera, weather: Weather) -> splats.Splats:
+        """Particles of a camera at the clock's time, padded, in centimetres."""
+        found = splats.particle_splats(
+            view,
+            self._clock_s,
+            weather,
+            int(self._controls.seed.value),
+            self._street.light,
+            shelter=self._street.scene.shelter,
+            max_particles=MOST_PARTICLES,
+            emphasis=float(self._controls.emphasis.value),
+        ).padded(CAPACITY)
+        return found._replace(
+            centres_m=found.centres_m * np.float32(PARTICLES_PER_M),
+            covariances_m2=found.covariances_m2 * np.float32(PARTICLES_PER_M**2),
+        )
 
 
 class _Street:

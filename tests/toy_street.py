@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from box_street import CARS, FACADES, BoxStreet
 
-from weather_aug.clip.types import Float64, Frame
+from weather_aug.clip.types import Camera, Float64, Frame, FrameKey
 from weather_aug.taxonomy import BUILDING, ROAD, SKY
 
 FINER = 2
@@ -17,9 +17,21 @@ COLOURS = {ROAD: (105, 105, 110), BUILDING: (170, 120, 90), SKY: (150, 180, 225)
 CAR_COLOUR = (40, 70, 160)
 
 
-def frames(views: int = 14, width: int = 320, height: int = 192, noise: float = 0.01) -> list[Frame]:
-    """A drive of 2.5 m a step, half of what `BoxStreet` drives; the depth has relative `noise`."""
-    street = BoxStreet(
+class _Slowly(BoxStreet):
+    """A metre a step."""
+
+    def camera(self, key: FrameKey) -> Camera:
+        camera = super().camera(key)
+        pose = camera.world_from_camera.copy()
+        pose[0, 3] = 1.0 * key.time_index
+        return replace(camera, world_from_camera=pose)
+
+
+def frames(
+    views: int = 14, width: int = 320, height: int = 192, noise: float = 0.01
+) -> list[Frame]:
+    """A drive of a metre a step; the depth has relative `noise`."""
+    street = _Slowly(
         boxes=(*FACADES, *CARS[2:12]), frames=views, width=FINER * width, height=FINER * height
     )
     return [_frame(street.frame(key), noise) for key in street.keys]

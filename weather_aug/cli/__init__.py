@@ -1,4 +1,4 @@
-"""The command line: build | render | sweep | export | inspect | demo."""
+"""The command line: build | render | sweep | export | view | inspect | demo."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from tyro.conf import Positional
 from weather_aug import __version__, _files
 from weather_aug.cli.render import Render
 from weather_aug.cli.terminal import check_folder, complain, say, to_people
+from weather_aug.cli.view import View
 from weather_aug.errors import (
     ArgumentError,
     DataError,
@@ -255,6 +256,7 @@ Command = (
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Sweep, tyro.conf.subcommand("sweep")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Inspect, tyro.conf.subcommand("inspect")]
 )
 

@@ -33,10 +33,10 @@ def save(folder: Path, head: Mapping[str, Any], state: Mapping[str, Tensor]) -> 
     """
     with _files.reported(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    arrays = {name: value.numpy() for name, value in state.items()}
-    text = np.frombuffer(json.dumps(head).encode(), np.uint8)
+    arrays: dict[str, Any] = {name: value.numpy() for name, value in state.items()}
+    arrays[HEAD] = np.frombuffer(json.dumps(head).encode(), np.uint8)
     buffer = io.BytesIO()
-    np.savez(buffer, **{HEAD: text}, **arrays)
+    np.savez(buffer, **arrays)
     _files.write_whole(folder / NAME, buffer.getvalue())
 
 
@@ -50,7 +50,8 @@ def load(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor]] | None:
     if not path.exists():
         return None
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        # numpy leaves a file open that it opened itself and could not read.
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             state = {name: torch.from_numpy(arrays[name]) for name in arrays.files if name != HEAD}
             return json.loads(arrays[HEAD].tobytes()), state
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:

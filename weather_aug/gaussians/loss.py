@@ -267,7 +267,7 @@ class _Found(torch.autograd.Function):
 def _found(argument: Tensor, total: float, slopes: Tensor, count: int) -> Tensor:
     """`total` / `count` as a function of `argument`, in which `total` has these slopes."""
     scale = 1 / max(count, 1)
-    value: Tensor = _Found.apply(argument, total, slopes, scale)  # type: ignore[no-untyped-call]
+    value: Tensor = _Found.apply(argument, total, slopes, scale)
     return value
 
 

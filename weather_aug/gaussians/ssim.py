@@ -124,7 +124,7 @@ def compared(
     # Inside a Function gradients are always off, so whether one is wanted is asked here.
     wants_gradient = image.requires_grad and torch.is_grad_enabled()
     arguments = image, target, weight_l1, weight_ssim, counted, wants_gradient
-    value: Tensor = _Compared.apply(*arguments)  # type: ignore[no-untyped-call]
+    value: Tensor = _Compared.apply(*arguments)
     return value
 
 

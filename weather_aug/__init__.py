@@ -16,9 +16,12 @@ _HOMES = {
     "Clip": "weather_aug.clip.types",
     "Frame": "weather_aug.clip.types",
     "FrameKey": "weather_aug.clip.types",
+    "FitOptions": "weather_aug.gaussians.options",
     "open_clip": "weather_aug.clip.open",
     "RenderOptions": "weather_aug.render.options",
     "RenderedFrame": "weather_aug.render.compose",
+    "Viewpoint": "weather_aug.scene.viewpoint",
+    "ViewpointJitter": "weather_aug.scene.viewpoint",
     "WeatherScene": "weather_aug.scene.scene",
     "WeatherPolicy": "weather_aug.scene.policy",
     "WeatherTimeline": "weather_aug.timeline",
@@ -35,10 +38,13 @@ if TYPE_CHECKING:
     from weather_aug.clip.types import Frame as Frame
     from weather_aug.clip.types import FrameKey as FrameKey
     from weather_aug.errors import WeatherAugError as WeatherAugError
+    from weather_aug.gaussians.options import FitOptions as FitOptions
     from weather_aug.render.compose import RenderedFrame as RenderedFrame
     from weather_aug.render.options import RenderOptions as RenderOptions
     from weather_aug.scene.policy import WeatherPolicy as WeatherPolicy
     from weather_aug.scene.scene import WeatherScene as WeatherScene
+    from weather_aug.scene.viewpoint import Viewpoint as Viewpoint
+    from weather_aug.scene.viewpoint import ViewpointJitter as ViewpointJitter
     from weather_aug.timeline import WeatherTimeline as WeatherTimeline
     from weather_aug.transforms.dataset import WeatherDataset as WeatherDataset
     from weather_aug.weather import Weather as Weather

@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from weather_aug._checks import finite
-from weather_aug._keys import check_seed, key_of
+from weather_aug._keys import key_of
 from weather_aug.clip.types import Frame
 from weather_aug.errors import ArgumentError
 from weather_aug.gaussians import checkpoint, loss
@@ -26,6 +25,7 @@ from weather_aug.gaussians.densify import Densification, Relocation
 from weather_aug.gaussians.frames import Target, resized, split, target_of
 from weather_aug.gaussians.initialise import scene_radius_m
 from weather_aug.gaussians.model import Model, Seen
+from weather_aug.gaussians.options import FitOptions
 from weather_aug.gaussians.pool import Pool, position_rate
 from weather_aug.gaussians.splitting import Splitting
 from weather_aug.gaussians.ssim import ssim
@@ -41,53 +41,12 @@ LEAST_COARSE_PX = 96
 """Smaller sides are not halved."""
 DEGREE_EVERY = 1000
 """Steps after which colours may change with the direction by one more degree (3DGS)."""
-STRATEGIES = ("relocation", "gradient", "none")
 DENSIFIED_SHARE = {"relocation": 0.8, "gradient": 0.5}
 """Of the steps, up to which Gaussians are moved or added (as of 30,000 in gsplat and 3DGS)."""
 GROWTH = 1.25
 """How many times as many Gaussians there may be in the end."""
 HELD_MEMORY = 2**31
 """Bytes of prepared frames that are kept; beyond it each is prepared when it is looked at."""
-
-
-@dataclass(frozen=True)
-class FitOptions:
-    """How a drive is fitted.
-
-    Raises:
-        ArgumentError: If a number is out of its range.
-    """
-
-    steps: int = 6000
-    """Pictures looked at, one a step."""
-    count: int = 100_000
-    """Gaussians of what stands still, at the most."""
-    scale: float = 1.0
-    """Of the frames' sides, in (0, 1]."""
-    sh_degree: int = 1
-    """Of the colours, 0..3."""
-    densify: str = "relocation"
-    """"relocation" (MCMC), "gradient" (3DGS) or "none"."""
-    held_out: int = 0
-    """Every n-th time step is held out and measured; none if 0."""
-    refine: bool = True
-    """Whether poses and exposures are learnt, too."""
-    sky_size: int = 256
-    """Texels along a side of the sky's faces, a power of 2."""
-    seed: int = 0
-    threads: int = 1
-    """Of the CPU's kernels; the result does not depend on it."""
-
-    def __post_init__(self) -> None:
-        finite("steps", self.steps, 1, 1e7)
-        finite("count", self.count, 1, 1e8)
-        finite("scale", self.scale, 1e-3, 1)
-        finite("threads", self.threads, 1, 1024)
-        if self.sh_degree not in (0, 1, 2, 3):
-            raise ArgumentError(f"sh_degree must be 0, 1, 2 or 3, got {self.sh_degree!r}")
-        if self.densify not in STRATEGIES:
-            raise ArgumentError(f"densify {self.densify!r} is not one of {', '.join(STRATEGIES)}")
-        check_seed("seed", self.seed)
 
 
 class Fitted(NamedTuple):

@@ -108,7 +108,9 @@ class _Projection(torch.autograd.Function):
         parts = torch.empty((count, projection.PARTS), dtype=torch.float32)
         depths = torch.empty(count, dtype=torch.float32)
         radii = torch.empty(count, dtype=torch.float32)
-        place, lens = view.detach().double().numpy(), lens_of(pinhole)
+        # Another memory order would be compiled anew.
+        place = np.ascontiguousarray(view.detach().double().numpy())
+        lens = lens_of(pinhole)
         projection.project(
             *(t.numpy() for t in inputs),
             place,

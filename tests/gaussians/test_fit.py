@@ -9,7 +9,7 @@ import toy_street
 
 from weather_aug.errors import ArgumentError, DataError
 from weather_aug.gaussians import checkpoint, fit, frames
-from weather_aug.gaussians.fit import FitOptions
+from weather_aug.gaussians.options import FitOptions
 from weather_aug.gaussians.types import Gaussians, Reconstruction
 
 SMALL = FitOptions(steps=12, count=800, sky_size=16)

@@ -15,7 +15,8 @@ from tiny_clip import TinyClip, digests_of
 
 from weather_aug.clip.types import Frame
 from weather_aug.errors import ArgumentError, ClipError, SceneError
-from weather_aug.gaussians.fit import FitOptions, Fitted
+from weather_aug.gaussians.fit import Fitted
+from weather_aug.gaussians.options import FitOptions
 from weather_aug.scene import reconstruct as reconstructing
 from weather_aug.scene import store
 from weather_aug.scene.scene import WeatherScene

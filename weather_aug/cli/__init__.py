@@ -89,7 +89,7 @@ class Build:
             if names:
                 raise ArgumentError(f"--{names[0]} needs --reconstruct")
             return {}
-        from weather_aug.gaussians.fit import FitOptions
+        from weather_aug.gaussians.options import FitOptions
 
         chosen: dict[str, Any] = {"reconstruct": True, "reconstruction": FitOptions(**given)}
         return chosen | ({} if self.styles is None else {"styles": self.styles})

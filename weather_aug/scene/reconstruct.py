@@ -32,7 +32,7 @@ from weather_aug.scene.records import FrameRecord, Manifest, StoredFile
 from weather_aug.scene.styles import style_weather
 
 if TYPE_CHECKING:
-    from weather_aug.gaussians.fit import FitOptions
+    from weather_aug.gaussians.options import FitOptions
     from weather_aug.gaussians.types import Reconstruction
 
 FITTING = "fitting"
@@ -84,7 +84,7 @@ def wanted_of(options: FitOptions | None, styles: Sequence[str]) -> Wanted:
     Raises:
         ArgumentError: If the options are none, or a style is no weather or stands twice.
     """
-    from weather_aug.gaussians.fit import FitOptions
+    from weather_aug.gaussians.options import FitOptions
 
     options = FitOptions() if options is None else options
     if not isinstance(options, FitOptions):

@@ -28,8 +28,8 @@ from weather_aug.weather import Weather
 
 if TYPE_CHECKING:
     from weather_aug.air import Air
-    from weather_aug.gaussians.fit import FitOptions
     from weather_aug.gaussians.gather import Weights
+    from weather_aug.gaussians.options import FitOptions
     from weather_aug.scene.novel import NovelFrame, Poses
 
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 class WeatherScene:
-    """A clip precomputed for weather: pictures, depth, labels, cameras and light on disk.
+    """A clip precomputed for weather: pictures, depth, labels, cameras, light, Gaussians on disk.
 
     Convention:
         A scene is immutable and holds only its folder's path: it opens lazily, and pickles to a
@@ -92,14 +92,12 @@ class WeatherScene:
             progress: Show bars.
             overwrite: Replace `out` if it is a scene already.
             reconstruct: Turn the frames into Gaussians as well, so that they can be rendered from
-                elsewhere; takes minutes. Interrupted work goes on from its last checkpoint.
+                elsewhere; takes minutes, and goes on from its last checkpoint.
             reconstruction: How; the default options if None.
-            styles: Weathers whose colours the Gaussians learn, as the editor shows them at the
-                heavy stop with nothing in the air.
+            styles: Weathers whose colours the Gaussians learn; see `scene.styles.style_weather`.
 
         Raises:
-            ArgumentError: If options of a reconstruction are given without `reconstruct`, or as
-                `build` and `scene.reconstruct.wanted_of` say.
+            ArgumentError: If `reconstruction` is given without `reconstruct`, or a choice is none.
         """
         from weather_aug.scene.build import build
 
@@ -326,7 +324,7 @@ class WeatherScene:
 
         Returns:
             The frame with depth, label where the scene is labelled, and boxes, and which of its
-            pixels recorded frames showed; all of them where that was not stored.
+            pixels recorded frames showed.
 
         Raises:
             ArgumentError: If the scene has no Gaussians or no such frame, both viewpoint and camera

@@ -1,7 +1,11 @@
-"""Rotations as quaternions (w, x, y, z), vectors and matrices: in numpy for what was recorded, in
-torch for what is learnt."""
+"""Rotations as quaternions (w, x, y, z), vectors and matrices.
+
+In numpy for what was recorded, in torch, with gradients, for what is learnt.
+"""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,7 +41,7 @@ def quaternions_of_tensor(rotations: Tensor) -> Tensor:
     return row / row.norm(dim=-1, keepdim=True)
 
 
-def _outer_rows(r):  # type: ignore[no-untyped-def]
+def _outer_rows(r: Any) -> list[list[Any]]:
     """The rows of 4 q qᵀ, of arrays or tensors (..., 3, 3)."""
     xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
     wx, wy, wz = (

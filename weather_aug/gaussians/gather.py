@@ -1,0 +1,272 @@
+"""All Gaussians of a drive at one moment, in one weather, as the rasteriser takes them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from weather_aug._checks import finite
+from weather_aug.errors import ArgumentError, printable
+from weather_aug.gaussians.actors import offset_basis, pose_at
+from weather_aug.gaussians.harmonics import colours_seen
+from weather_aug.gaussians.rotations import quaternions_of
+from weather_aug.gaussians.types import Float32, Reconstruction, Sky, Style
+
+Float64 = NDArray[np.float64]
+Weights = Mapping[str, float]
+RIGID_TOLERANCE = 1e-4
+
+
+class Placed(NamedTuple):
+    """Where the Gaussians of one actor stand among the gathered ones."""
+
+    track_id: int
+    rows: slice
+    """Of the gathered tensors."""
+    world_from_actor: Float64
+    """(4, 4), metres."""
+
+
+class Gathered(NamedTuple):
+    """R Gaussians in one frame, activated, float32 on the CPU: background first, then actors."""
+
+    means_m: Tensor
+    """(R, 3), in world axes, from `origin_m`."""
+    quaternions: Tensor
+    """(R, 4), (w, x, y, z)."""
+    scales_m: Tensor
+    """(R, 3), standard deviations."""
+    opacities: Tensor
+    """(R,) in 0..1."""
+    sh: Tensor
+    """(R, K, 3); an actor's are in its own axes, so that its look turns with it."""
+    class_scores: Tensor
+    """(R, C); C = 0 if unlabelled or not asked for."""
+    rows: Tensor
+    """(R,) int64: place of each among the background's Gaussians followed by all actors'."""
+    actors: tuple[Placed, ...]
+    origin_m: Float64
+    """(3,) of the tensors, in the world."""
+
+    def colours_seen(
+        self, centre_m: ArrayLike, sh: Tensor | None = None, degree: int | None = None
+    ) -> Tensor:
+        """Colours (R, 3) in sRGB, at least 0, seen from `centre_m` (3,) in the world.
+
+        Args:
+            centre_m: Of the camera.
+            sh: (R, K, 3) other coefficients than the gathered ones; gradients flow to them.
+            degree: Highest degree to use; all if None.
+        """
+        sh = self.sh if sh is None else sh
+        towards = self.means_m - _tensor(np.asarray(centre_m, np.float64) - self.origin_m)
+        if self.actors:
+            towards = towards.clone()
+            for placed in self.actors:
+                # Row vectors: multiplying by world_from_actor turns them into the actor's axes.
+                towards[placed.rows] @= _tensor(placed.world_from_actor[:3, :3])
+        return colours_seen(sh, towards, torch.zeros(3), degree)
+
+
+def gather(
+    reconstruction: Reconstruction,
+    time_s: float,
+    *,
+    style: str | Weights | None = None,
+    amount: float = 1.0,
+    without: Collection[int] = (),
+    poses: Mapping[int, ArrayLike] | None = None,
+    origin_m: ArrayLike = (0.0, 0.0, 0.0),
+    labels: bool = True,
+) -> Gathered:
+    """The background and the actors present at `time_s`, each at its place.
+
+    Args:
+        reconstruction: The drive. Its means are float32 in world axes: to 0.1 mm within 1 km of
+            the world's origin, to 1 mm within 10 km.
+        time_s: Moment, in the clip's time.
+        style: A name in `reconstruction.styles`, or weights by name, at least 0 and together at
+            most 1; what is missing to 1 is the scene's own colours. None is the scene's own.
+        amount: In 0..1, how far to go from the scene's own colours to the style's.
+        without: Track ids of actors to leave out.
+        poses: `world_from_actor` (4, 4) by track id: puts actors elsewhere, also while they were
+            not there.
+        origin_m: (3,) of the tensors returned. The camera's centre keeps the most digits.
+        labels: Whether to gather the class scores.
+
+    Raises:
+        ArgumentError: If a style or a track is unknown, weights or amount leave their range, or a
+            pose is not a rigid motion.
+    """
+    weights = style_weights(reconstruction, style, amount)
+    origin = np.asarray(origin_m, np.float64)
+    placed = _placed(reconstruction, time_s, without, poses or {})
+    background, shells = reconstruction.background, reconstruction.actor_gaussians
+    members = [np.flatnonzero(reconstruction.owners == index) for index, _ in placed]
+    picked = np.concatenate([*members, np.zeros(0, np.intp)]).astype(np.int64)
+
+    means = [background.means_m - origin]
+    quaternions = [background.quaternions]
+    actors = []
+    start = len(background)
+    for (index, world_from_actor), rows in zip(placed, members, strict=True):
+        actor = reconstruction.actors[index]
+        offsets = reconstruction.offsets_m[rows]
+        local = shells.means_m[rows].astype(np.float64)
+        if actor.is_deformable:
+            basis = offset_basis(actor.times_s, time_s, offsets.shape[1])
+            local = local + np.einsum("mbi,b->mi", offsets, basis)
+        rotation, shift_m = world_from_actor[:3, :3], world_from_actor[:3, 3] - origin
+        means.append(local @ rotation.T + shift_m)
+        quaternions.append(_turned(quaternions_of(rotation), shells.quaternions[rows]))
+        actors.append(Placed(actor.track_id, slice(start, start + len(rows)), world_from_actor))
+        start += len(rows)
+
+    def both(name: str) -> Tensor:
+        parts = getattr(background, name), getattr(shells, name)[picked]
+        return _joined(parts)
+
+    return Gathered(
+        means_m=_joined(means),
+        quaternions=_joined(quaternions),
+        scales_m=both("log_scales").exp_(),
+        opacities=both("logit_opacities").sigmoid_(),
+        sh=_blended_sh(reconstruction, weights, picked),
+        class_scores=both("class_scores") if labels else torch.zeros(start, 0),
+        rows=torch.from_numpy(
+            np.concatenate([np.arange(len(background)), len(background) + picked])
+        ),
+        actors=tuple(actors),
+        origin_m=origin,
+    )
+
+
+def sky_of(reconstruction: Reconstruction, style: str | Weights | None, amount: float) -> Sky:
+    """The sky in a style; arguments as of `gather`."""
+    weights = style_weights(reconstruction, style, amount)
+    sky = reconstruction.sky
+    if not weights:
+        return sky
+    styled = {name: reconstruction.styles[name].sky for name in weights}
+    return Sky(_blend(sky.faces, styled, weights), sky.seen)
+
+
+def style_weights(
+    reconstruction: Reconstruction, style: str | Weights | None, amount: float
+) -> dict[str, float]:
+    """Weights above 0 by name of the style; arguments and errors as of `gather`."""
+    amount = finite("amount", amount, 0.0, 1.0)
+    if style is None:
+        return {}
+    weights = {style: 1.0} if isinstance(style, str) else dict(style)
+    for name, weight in weights.items():
+        if name not in reconstruction.styles:
+            known = ", ".join(reconstruction.styles) or "none: fit one with styles.fit_style"
+            raise ArgumentError(f"style {printable(name)!r} is unknown; there is {known}")
+        finite(f"the weight of style {name!r}", weight, 0.0)
+    total = sum(weights.values())
+    # Shares that are written in decimals may add up to a little more than 1.
+    if not total <= 1 + 1e-6:
+        raise ArgumentError(f"the weights of styles must add up to at most 1, got {total:g}")
+    return {name: amount * weight for name, weight in weights.items() if amount * weight > 0}
+
+
+def _placed(
+    reconstruction: Reconstruction,
+    time_s: float,
+    without: Collection[int],
+    poses: Mapping[int, ArrayLike],
+) -> list[tuple[int, Float64]]:
+    """Index and pose of each actor that is to be drawn."""
+    known = {actor.track_id for actor in reconstruction.actors}
+    for name, tracks in (("without", without), ("poses", poses)):
+        unknown = set(tracks) - known
+        if unknown:
+            raise ArgumentError(
+                f"{name} names track {sorted(unknown)[0]}, which the reconstruction does not have; "
+                f"its tracks are {sorted(known)}"
+            )
+    placed = []
+    for index, actor in enumerate(reconstruction.actors):
+        if actor.track_id in without:
+            continue
+        if actor.track_id in poses:
+            placed.append((index, _rigid(actor.track_id, poses[actor.track_id])))
+        else:
+            pose = pose_at(actor, time_s)
+            if pose is not None:
+                placed.append((index, pose))
+    return placed
+
+
+def _rigid(track_id: int, pose: ArrayLike) -> Float64:
+    matrix = np.asarray(pose, np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ArgumentError(f"poses[{track_id}] must be a finite (4, 4) matrix, got {matrix.shape}")
+    rotation = matrix[:3, :3]
+    off = max(
+        np.abs(rotation.T @ rotation - np.eye(3)).max(), np.abs(matrix[3] - (0, 0, 0, 1)).max()
+    )
+    if off > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise ArgumentError(
+            f"poses[{track_id}] is not a rigid motion (off by {off:.2g}); it must rotate and shift"
+        )
+    return matrix
+
+
+def _turned(by: Float64, quaternions: Float32) -> Float64:
+    """Products `by` ⊗ q, (M, 4)."""
+    w, x, y, z = by
+    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    return quaternions @ left.T
+
+
+def _blended_sh(
+    reconstruction: Reconstruction, weights: Weights, picked: NDArray[np.int64]
+) -> Tensor:
+    def parts(styles: Mapping[str, Style]) -> dict[str, tuple[Any, Any]]:
+        return {name: (style.sh, style.actor_sh[picked]) for name, style in styles.items()}
+
+    own = reconstruction.background.sh, reconstruction.actor_gaussians.sh[picked]
+    styled = parts({name: reconstruction.styles[name] for name in weights})
+    coefficients = max(
+        part.shape[1] for pair in (own, *styled.values()) for part in pair if len(part)
+    )
+    blended = [
+        _blend(
+            _padded(own[side], coefficients),
+            {name: _padded(pair[side], coefficients) for name, pair in styled.items()},
+            weights,
+        )
+        for side in (0, 1)
+    ]
+    return _joined(blended)
+
+
+def _blend(own: NDArray[Any], styled: Mapping[str, NDArray[Any]], weights: Weights) -> Float32:
+    if not weights:
+        return own.astype(np.float32, copy=False)
+    blended = np.float32(1 - sum(weights.values())) * own.astype(np.float32)
+    for name, weight in weights.items():
+        blended += np.float32(weight) * styled[name].astype(np.float32)
+    return blended
+
+
+def _padded(sh: NDArray[Any], coefficients: int) -> NDArray[Any]:
+    """`sh` with zeros for the degrees that it does not have."""
+    missing = coefficients - sh.shape[1]
+    return np.pad(sh, ((0, 0), (0, missing), (0, 0))) if missing > 0 else sh
+
+
+def _joined(parts: Sequence[NDArray[Any]]) -> Tensor:
+    # A copy always: stored arrays are read-only, and the caller owns the tensors.
+    return torch.from_numpy(np.concatenate(parts, dtype=np.float32, casting="same_kind"))
+
+
+def _tensor(array: NDArray[Any]) -> Tensor:
+    return torch.from_numpy(np.array(array, np.float32))

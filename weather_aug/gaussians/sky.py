@@ -1,0 +1,326 @@
+"""What is behind all Gaussians: a cube map that is learnt, sampled and filled.
+
+Convention:
+    Faces and texels are in OpenGL's layout, see `types.Sky`. Colours between texel centres are
+    bilinear, over the edges between faces as well; where three faces meet, two of the three texels
+    count. The map is at infinity: only the rotation of a camera matters, and the sky gives no
+    gradient to it, because a smooth sky would pull at poses that the street fixes far better.
+    float32 on a CPU goes through compiled loops, all else through torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from weather_aug.clip.types import Frame
+from weather_aug.errors import ArgumentError
+from weather_aug.gaussians import sky_kernels
+from weather_aug.gaussians.cube import table_of, texel_directions, texels_of
+from weather_aug.gaussians.types import Pinhole, Sky
+from weather_aug.taxonomy import TRAIN_ID
+
+Float32 = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+SIZE = 256
+"""Texels along the side of a face: 0.22 to 0.45 degrees each."""
+MAX_SIZE = 4096
+LEARNING_RATE = 0.01
+"""For Adam (OmniRe)."""
+UNKNOWN = 0.5
+"""Of a map that nothing has been learnt about."""
+RIM_WEIGHT = 0.02
+"""Of a sky pixel beside what is no sky: it shows some of that, too, and counts where no other
+does."""
+
+
+class SkyMap(nn.Module):
+    """A cube map to be learnt; see the module's Convention.
+
+    Args:
+        size: Texels along the side of a face, a power of 2 up to 4096.
+        colour: sRGB of the whole map at first.
+
+    Raises:
+        ArgumentError: If the size is no power of 2 up to 4096.
+    """
+
+    seen: Tensor
+    """(6, S, S) bool: a recorded frame showed sky there."""
+
+    def __init__(
+        self, size: int = SIZE, colour: tuple[float, float, float] = (UNKNOWN,) * 3
+    ) -> None:
+        super().__init__()
+        size = _checked_size(size)
+        self.faces = nn.Parameter(torch.tensor(colour).repeat(6, size, size, 1))
+        """(6, S, S, 3) sRGB; learning may leave 0..1, `to_sky` does not."""
+        self.register_buffer("seen", torch.zeros(6, size, size, dtype=torch.bool))
+
+    @classmethod
+    def of(cls, frames: Iterable[Frame], size: int = SIZE) -> SkyMap:
+        """A map of the mean colours of all recorded sky pixels, unseen texels from around them.
+
+        Sky is where the depth is `inf`; of a frame without depth, where the label says so; a frame
+        with neither shows none. Without any sky the map is grey.
+
+        Args:
+            frames: Read once, one after the other.
+            size: Texels along the side of a face, a power of 2 up to 4096.
+
+        Raises:
+            ArgumentError: If the size is no power of 2 up to 4096.
+        """
+        size = _checked_size(size)
+        sums = np.zeros((6 * size * size, 4), np.float32)
+        for frame in frames:
+            _gather(sums, frame, size)
+        sky = cls(size)
+        seen = (sums[:, 3] > 0).reshape(6, size, size)
+        with torch.no_grad():
+            sky.faces.copy_(torch.from_numpy(_filled(sums.reshape(6, size, size, 4))))
+        sky.seen = torch.from_numpy(seen)
+        return sky
+
+    def colours(self, directions_world: Tensor) -> Tensor:
+        """Colours (..., 3), sRGB, in directions (..., 3) of any length above 0.
+
+        Gradients go to the map only.
+        """
+        flat = directions_world.detach().reshape(-1, 3)
+        if _is_compiled(self.faces):
+            sampled: Tensor = _Sampled.apply(self.faces, flat)  # type: ignore[no-untyped-call]
+        else:
+            sampled = _sampled(self.faces, flat)
+        return sampled.reshape(directions_world.shape)
+
+    def background(
+        self,
+        pinhole: Pinhole,
+        world_from_camera: Tensor | NDArray[Any],
+        needed: Tensor | None = None,
+    ) -> Tensor:
+        """Colours (H, W, 3), sRGB, behind a picture.
+
+        Args:
+            pinhole: Lens and size of the picture.
+            world_from_camera: (4, 4); it gets no gradient.
+            needed: (H, W) bool; other pixels, for instance those that Gaussians hide, are 0.
+
+        Raises:
+            ArgumentError: If `needed` is not bool of the picture's size.
+        """
+        shape = (pinhole.height, pinhole.width)
+        if needed is not None and (needed.shape != shape or needed.dtype != torch.bool):
+            raise ArgumentError(
+                f"needed must be bool {shape} like the picture, got {needed.dtype} "
+                f"{tuple(needed.shape)}"
+            )
+        matrix = _world_from_pixel(pinhole, world_from_camera)
+        if _is_compiled(self.faces):
+            mask = np.ones(shape, bool) if needed is None else needed.contiguous().cpu().numpy()
+            picture: Tensor = _Pictured.apply(self.faces, matrix, mask)  # type: ignore[no-untyped-call]
+            return picture
+        colours = _sampled(self.faces, _directions(matrix, shape, self.faces)).reshape(*shape, 3)
+        return colours if needed is None else torch.where(needed[..., None], colours, 0.0)
+
+    def to_sky(self) -> Sky:
+        """The map as plain arrays, its colours in 0..1."""
+        faces = self.faces.detach().float().clamp(0.0, 1.0).cpu().numpy().copy()
+        return Sky(faces, self.seen.cpu().numpy().copy())
+
+
+def sky_colours(sky: Sky, directions_world: NDArray[Any]) -> Float32:
+    """Colours (..., 3), sRGB, of a sky in directions (..., 3) of any length above 0."""
+    faces, size = _flat(sky)
+    directions = np.ascontiguousarray(directions_world, np.float32)
+    out = np.empty_like(directions)
+    sky_kernels.sample(faces, table_of(size), directions.reshape(-1, 3), out.reshape(-1, 3))
+    return out
+
+
+def sky_picture(
+    sky: Sky,
+    pinhole: Pinhole,
+    world_from_camera: NDArray[Any],
+    needed: Bools | None = None,
+) -> Float32:
+    """Colours (H, W, 3), sRGB, of a sky behind a picture; see `SkyMap.background`."""
+    faces, size = _flat(sky)
+    shape = (pinhole.height, pinhole.width)
+    mask = np.ones(shape, bool) if needed is None else np.ascontiguousarray(needed, bool)
+    if mask.shape != shape:
+        raise ArgumentError(f"needed must be bool {shape} like the picture, got {mask.shape}")
+    out = np.zeros((shape[0] * shape[1], 3), np.float32)
+    matrix = _world_from_pixel(pinhole, world_from_camera)
+    sky_kernels.sample_picture(faces, table_of(size), matrix, mask, out)
+    return out.reshape(*shape, 3)
+
+
+def sky_seen(sky: Sky, directions_world: NDArray[Any]) -> Bools:
+    """(...) whether a recorded frame showed sky in directions (..., 3)."""
+    seen: Bools = sky.seen.reshape(-1)[texels_of(directions_world, sky.seen.shape[1])]
+    return seen
+
+
+def _world_from_pixel(pinhole: Pinhole, world_from_camera: Tensor | NDArray[Any]) -> Float32:
+    """(3, 3) map of (column, row, 1) to directions in world axes."""
+    if isinstance(world_from_camera, Tensor):
+        world_from_camera = world_from_camera.detach().cpu().numpy()
+    camera_from_pixel = np.array(
+        [
+            [1 / pinhole.fx_px, 0, -pinhole.cx_px / pinhole.fx_px],
+            [0, 1 / pinhole.fy_px, -pinhole.cy_px / pinhole.fy_px],
+            [0, 0, 1],
+        ]
+    )
+    return (world_from_camera[:3, :3] @ camera_from_pixel).astype(np.float32)
+
+
+def _directions(world_from_pixel: Float32, shape: tuple[int, int], like: Tensor) -> Tensor:
+    """(H W, 3) of all pixels."""
+    rows, columns = torch.meshgrid(*(torch.arange(side) for side in shape), indexing="ij")
+    pixels = torch.stack([columns, rows, torch.ones_like(rows)], -1).reshape(-1, 3).to(like)
+    return pixels @ torch.from_numpy(world_from_pixel).to(like).T
+
+
+def _is_compiled(faces: Tensor) -> bool:
+    return faces.device.type == "cpu" and faces.dtype == torch.float32
+
+
+def _sampled(faces: Tensor, directions: Tensor) -> Tensor:
+    """`sky_kernels.sample` in torch, for any device and type: (N, 3)."""
+    size = faces.shape[1]
+    wide = size + 2
+    table = torch.from_numpy(table_of(size).reshape(-1).astype(np.int64)).to(faces.device)
+    x, y, z = directions.to(faces.dtype).unbind(-1)
+    major = directions.abs().argmax(-1, keepdim=True)
+    value = directions.to(faces.dtype).gather(-1, major)
+    face = 2 * major + (value <= 0)
+    across = torch.stack([-z, z, x, x, x, -x], -1).gather(-1, face) / value.abs()
+    down = torch.stack([-y, -y, z, -z, -y, -y], -1).gather(-1, face) / value.abs()
+    column, row = ((0.5 * size * (place + 1) + 0.5)[:, 0] for place in (across, down))
+    left, top = (place.floor().nan_to_num().clamp(0, size) for place in (column, row))
+    corner = (face[:, 0] * wide + top.long()) * wide + left.long()
+    flat = faces.reshape(-1, 3)
+    right, lower = (column - left)[:, None], (row - top)[:, None]
+    upper_row = torch.lerp(flat[table[corner]], flat[table[corner + 1]], right)
+    lower_row = torch.lerp(flat[table[corner + wide]], flat[table[corner + wide + 1]], right)
+    return torch.lerp(upper_row, lower_row, lower)
+
+
+class _Sampled(torch.autograd.Function):
+    """Colours of directions, differentiable in the faces."""
+
+    @staticmethod
+    def forward(ctx: Any, faces: Tensor, directions: Tensor) -> Tensor:
+        ctx.directions = directions.to(torch.float32).contiguous().cpu().numpy()
+        ctx.faces_shape = faces.shape
+        out = np.empty_like(ctx.directions)
+        flat = faces.detach().contiguous().numpy().reshape(-1, 3)
+        sky_kernels.sample(flat, table_of(faces.shape[1]), ctx.directions, out)
+        return torch.from_numpy(out)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        to_faces = np.zeros((ctx.faces_shape[:3].numel(), 3), np.float32)
+        table = table_of(ctx.faces_shape[1])
+        sky_kernels.scatter(grad.contiguous().numpy(), table, ctx.directions, to_faces)
+        return torch.from_numpy(to_faces).reshape(ctx.faces_shape), None
+
+
+class _Pictured(torch.autograd.Function):
+    """A picture of the sky, differentiable in the faces."""
+
+    @staticmethod
+    def forward(ctx: Any, faces: Tensor, world_from_pixel: Float32, needed: Bools) -> Tensor:
+        ctx.view = world_from_pixel, needed
+        ctx.faces_shape = faces.shape
+        out = np.zeros((needed.size, 3), np.float32)
+        flat = faces.detach().contiguous().numpy().reshape(-1, 3)
+        sky_kernels.sample_picture(flat, table_of(faces.shape[1]), world_from_pixel, needed, out)
+        return torch.from_numpy(out).reshape(*needed.shape, 3)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        to_faces = np.zeros((ctx.faces_shape[:3].numel(), 3), np.float32)
+        table = table_of(ctx.faces_shape[1])
+        flat = grad.contiguous().numpy().reshape(-1, 3)
+        sky_kernels.scatter_picture(flat, table, *ctx.view, to_faces)
+        return torch.from_numpy(to_faces).reshape(ctx.faces_shape), None, None
+
+
+def _checked_size(size: int) -> int:
+    if not (isinstance(size, int) and 1 <= size <= MAX_SIZE and size & (size - 1) == 0):
+        raise ArgumentError(f"size must be a power of 2 up to {MAX_SIZE}, got {size!r}")
+    return size
+
+
+def _flat(sky: Sky) -> tuple[Float32, int]:
+    """Faces (T, 3) and their side."""
+    faces = np.ascontiguousarray(sky.faces, np.float32)
+    return faces.reshape(-1, 3), faces.shape[1]
+
+
+def _gather(sums: Float32, frame: Frame, size: int) -> None:
+    """Add the colours of a frame's sky pixels, and their weights, to the flat texels (T, 4)."""
+    sky = _sky_of(frame)
+    if not sky.any():
+        return
+    # cv2 takes what is outside the picture for sky.
+    inner = cv2.erode(sky.astype(np.uint8), np.ones((3, 3), np.uint8))
+    weights = np.where(inner > 0, np.float32(1.0), np.float32(RIM_WEIGHT))
+    pinhole = Pinhole.of(frame.camera)
+    matrix = _world_from_pixel(pinhole, frame.camera.world_from_camera)
+    # Pixels wider than the texels in a corner of a face, a third of those in its middle, would
+    # leave gaps.
+    steps = int(np.ceil(1.5 * size / min(pinhole.fx_px, pinhole.fy_px)))
+    weights /= np.float32(steps**2)
+    values = np.empty((*sky.shape, 4), np.float32)
+    values[..., :3] = frame.image.astype(np.float32) * (weights / np.float32(255.0))[..., None]
+    values[..., 3] = weights
+    shifts = (np.arange(steps) + 0.5) / steps - 0.5
+    for down in shifts:
+        for across in shifts:
+            shift = np.array([[1, 0, across], [0, 1, down], [0, 0, 1]])
+            moved = (matrix @ shift).astype(np.float32)
+            sky_kernels.scatter_picture(values.reshape(-1, 4), table_of(size), moved, sky, sums)
+
+
+def _sky_of(frame: Frame) -> Bools:
+    if frame.depth_m is not None:
+        return np.isposinf(frame.depth_m)
+    if frame.label is not None:
+        return np.asarray(frame.label == TRAIN_ID["sky"])
+    return np.zeros(frame.image.shape[:2], bool)
+
+
+def _filled(sums: Float32) -> Float32:
+    """(6, S, S, 3) mean colours of sums (6, S, S, 4); unseen texels from maps of half the size."""
+    size = sums.shape[1]
+    weights = sums[..., 3:]
+    seen = weights[..., 0] > 0
+    colours = (sums[..., :3] / np.where(weights > 0, weights, 1)).astype(np.float32)
+    if seen.all():
+        return colours
+    if size == 1:
+        colours[~seen] = colours[seen].mean(axis=0) if seen.any() else UNKNOWN
+        return colours
+    # Each seen texel counts the same, however often it was seen.
+    plain = np.concatenate([colours, seen[..., None].astype(np.float32)], axis=-1)
+    plain[~seen] = 0.0
+    coarse = _filled(plain.reshape(6, size // 2, 2, size // 2, 2, 4).sum(axis=(2, 4)))
+    unseen = np.ascontiguousarray(texel_directions(size)[~seen])
+    filled = np.empty_like(unseen)
+    sky_kernels.sample(coarse.reshape(-1, 3), table_of(size // 2), unseen, filled)
+    colours[~seen] = filled
+    return colours

@@ -13,7 +13,9 @@ from weather_aug.gaussians import harmonics_kernels as kernels
 from weather_aug.gaussians.types import SH_COEFFICIENTS
 
 
-def colours_seen(sh: Tensor, means_m: Tensor, centre_m: Tensor, degree: int | None = None) -> Tensor:
+def colours_seen(
+    sh: Tensor, means_m: Tensor, centre_m: Tensor, degree: int | None = None
+) -> Tensor:
     """sRGB (N, 3), at least 0, of Gaussians seen from `centre_m`; all inputs carry gradients.
 
     Args:

@@ -89,7 +89,9 @@ def _covariance(flat):
 
 
 @compiled
-def project(means, quaternions, scales, opacities, view, lens, near, antialiased, parts, depths, radii):
+def project(
+    means, quaternions, scales, opacities, view, lens, near, antialiased, parts, depths, radii
+):
     """Fill `parts` (N, 6), `depths` and `radii` (N,); a radius of 0 is not drawn.
 
     Args:
@@ -256,9 +258,7 @@ def _quaternion_back(quaternion, length, d_rotation, row):
     w, x = float(quaternion[0]) / length, float(quaternion[1]) / length
     y, z = float(quaternion[2]) / length, float(quaternion[3]) / length
     d = d_rotation
-    d_w = 2.0 * (
-        x * (d[2, 1] - d[1, 2]) + y * (d[0, 2] - d[2, 0]) + z * (d[1, 0] - d[0, 1])
-    )
+    d_w = 2.0 * (x * (d[2, 1] - d[1, 2]) + y * (d[0, 2] - d[2, 0]) + z * (d[1, 0] - d[0, 1]))
     d_x = 2.0 * (
         w * (d[2, 1] - d[1, 2])
         + y * (d[0, 1] + d[1, 0])

@@ -150,9 +150,7 @@ class _Blend(torch.autograd.Function):
         channels = planes.shape[1]
         parts = np.empty((len(tiles.order), projection.PARTS), np.float32)
         values = np.empty((len(tiles.order), channels), np.float32)
-        kernels.gather(
-            tiles.order, shapes.detach().numpy(), planes.detach().numpy(), parts, values
-        )
+        kernels.gather(tiles.order, shapes.detach().numpy(), planes.detach().numpy(), parts, values)
         left = torch.empty((height, width), dtype=torch.float32)
         blended = torch.empty((height, width, channels), dtype=torch.float32)
         ends = np.empty(len(tiles.starts) - 1, np.int64)

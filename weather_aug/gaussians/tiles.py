@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,76 +47,84 @@ def tiles_of(
     keys.sort()
     order = (keys & np.uint64(0xFFFFFFFF)).astype(np.uint32)
     columns, rows = -(-width // TILE_PX), -(-height // TILE_PX)
-    spans: Any = np.empty(len(order) + 1, np.int64)
+    firsts = np.empty(len(order), np.int32)
+    spans = np.empty(len(order) + 1, np.int64)
+    touched = np.empty((_spans(parts, order, rows, firsts, spans), 2), np.int32)
     counts = np.zeros(columns * rows + 1, np.int64)
-    touched = np.empty((_spans(parts, order, columns, rows, spans), 2), np.int32)
-    _count(parts, order, columns, spans, touched, counts)
+    _count(parts, order, columns, firsts, spans, touched, counts)
     starts = np.cumsum(counts)
     ranks = np.empty(int(starts[-1]), np.int32)
-    _fill(parts, order, columns, spans, touched, starts[:-1].copy(), ranks)
+    _fill(columns, firsts, spans, touched, starts[:-1].copy(), ranks)
     return Tiles(order, starts, ranks)
 
 
-@inlined
-def _tile_rows(part, rows):
-    """First row of tiles that a splat may touch, and the one after the last."""
-    reach = 2.0 * math.log(float(part[5]) / LEAST_ALPHA)
-    a, b, c = float(part[2]), float(part[3]), float(part[4])
-    high = math.sqrt(max(reach, 0.0) * a / (a * c - b * b))
-    first = math.floor((float(part[1]) - high) / TILE_PX)
-    last = math.floor((float(part[1]) + high) / TILE_PX)
-    return max(int(first), 0), min(int(last) + 1, rows)
-
-
 @compiled
-def _spans(parts, order, columns, rows, spans):
-    """Where each splat's spans begin, one for each row of tiles; returns how many there are."""
+def _spans(parts, order, rows, firsts, spans):
+    """The first row of tiles of each splat, and where its spans begin: one for each row of tiles.
+
+    Returns:
+        How many spans there are.
+    """
     total = 0
     for i in range(order.shape[0]):
+        part = parts[order[i]]
+        a, b, c = float(part[2]), float(part[3]), float(part[4])
+        high = math.sqrt(_reach(part) * a / (a * c - b * b))
+        first = max(math.floor((float(part[1]) - high) / TILE_PX), 0)
+        last = min(math.floor((float(part[1]) + high) / TILE_PX), rows - 1)
+        firsts[i] = first
         spans[i] = total
-        first, last = _tile_rows(parts[order[i]], rows)
-        total += max(last - first, 0)
+        total += max(int(last - first) + 1, 0)
     spans[order.shape[0]] = total
     return total
 
 
+@inlined
+def _reach(part):
+    """Twice the σ at which a splat falls to the cut."""
+    return max(2.0 * math.log(float(part[5]) / LEAST_ALPHA), 0.0)
+
+
 @compiled
-def _count(parts, order, columns, spans, touched, counts):
+def _count(parts, order, columns, firsts, spans, touched, counts):
     """The tiles from and to which each span goes; counts[tile + 1] how many touch a tile."""
     for i in range(order.shape[0]):
         part = parts[order[i]]
         u, v = float(part[0]), float(part[1])
         a, b, c = float(part[2]), float(part[3]), float(part[4])
-        reach = max(2.0 * math.log(float(part[5]) / LEAST_ALPHA), 0.0)
         area = a * c - b * b
+        reach = _reach(part)
         wide = math.sqrt(reach * c / area)
-        # Where the ellipse is widest: to its right at `slant` below the centre, to its left above.
+        # Half a pixel of margin: the kernel decides on each pixel by itself.
+        leftmost = max(math.floor((u - wide - 0.5) / TILE_PX), 0)
+        rightmost = min(math.floor((u + wide + 0.5) / TILE_PX), columns - 1)
+        # The ellipse is widest to its right at `slant` below the centre, to its left above it.
         slant = -b / c * wide
-        first, _ = _tile_rows(part, 1 << 30)
+        a_inverse = 1.0 / a
         for s in range(spans[i], spans[i + 1]):
-            row = first + s - spans[i]
-            top = row * TILE_PX - v
-            bottom = top + (TILE_PX - 1)
-            at = min(max(slant, top), bottom)
-            right = (-b * at + math.sqrt(max(b * b * at * at - a * (c * at * at - reach), 0.0))) / a
-            at = min(max(-slant, top), bottom)
-            left = (-b * at - math.sqrt(max(b * b * at * at - a * (c * at * at - reach), 0.0))) / a
-            # Half a pixel of margin: the kernel decides on each pixel by itself.
-            low = max(int(math.floor((u + left - 0.5) / TILE_PX)), 0)
-            high = min(int(math.floor((u + right + 0.5) / TILE_PX)) + 1, columns)
+            row = firsts[i] + s - spans[i]
+            low, high = leftmost, rightmost
+            if high > low:
+                top = row * TILE_PX - v
+                bottom = top + (TILE_PX - 1)
+                at = min(max(slant, top), bottom)
+                right = (math.sqrt(max(a * reach - area * at * at, 0.0)) - b * at) * a_inverse
+                at = min(max(-slant, top), bottom)
+                left = (-math.sqrt(max(a * reach - area * at * at, 0.0)) - b * at) * a_inverse
+                low = max(math.floor((u + left - 0.5) / TILE_PX), low)
+                high = min(math.floor((u + right + 0.5) / TILE_PX), high)
             touched[s, 0] = low
-            touched[s, 1] = high
-            for x in range(low, high):
+            touched[s, 1] = high + 1
+            for x in range(low, high + 1):
                 counts[row * columns + x + 1] += 1
 
 
 @compiled
-def _fill(parts, order, columns, spans, touched, places, ranks):
+def _fill(columns, firsts, spans, touched, places, ranks):
     """Write the lists; `places` is where the next entry of each tile goes."""
-    for i in range(order.shape[0]):
-        first, _ = _tile_rows(parts[order[i]], 1 << 30)
+    for i in range(firsts.shape[0]):
         for s in range(spans[i], spans[i + 1]):
-            tile = (first + s - spans[i]) * columns
+            tile = (firsts[i] + s - spans[i]) * columns
             for x in range(touched[s, 0], touched[s, 1]):
                 ranks[places[tile + x]] = i
                 places[tile + x] += 1

@@ -16,7 +16,7 @@ from weather_aug.gaussians.types import SH_COEFFICIENTS
 def colours_seen(
     sh: Tensor, means_m: Tensor, centre_m: Tensor, degree: int | None = None
 ) -> Tensor:
-    """sRGB (N, 3), at least 0, of Gaussians seen from `centre_m`; all inputs carry gradients.
+    """SRGB (N, 3), at least 0, of Gaussians seen from `centre_m`; all inputs carry gradients.
 
     Args:
         sh: (N, K, 3) float32 coefficients on the CPU.

@@ -95,7 +95,10 @@ def project(
     """Fill `parts` (N, 6), `depths` and `radii` (N,); a radius of 0 is not drawn.
 
     Args:
-        means: (N, 3), and so on as in `rasterise`.
+        means: (N, 3).
+        quaternions: (N, 4).
+        scales: (N, 3).
+        opacities: (N,).
         view: (4, 4) float64, camera from world.
         lens: fx, fy, cx, cy, and the limits of -x/z, x/z, -y/z, y/z for the Jacobian.
         near: Nearest z, metres.

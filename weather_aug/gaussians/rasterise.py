@@ -71,38 +71,66 @@ def rasterise(
         3DGS (Kerbl et al. 2023); constants of gsplat 1.6: dilation 0.3 px², alpha from 1/255 to
         0.99, stop at 1e-4 of the light. (gsplat 1.5 caps alpha at 0.999 instead.)
     """
-    count = len(means_m)
-    _check("means_m", means_m, (count, 3), means_m)
-    _check("quaternions", quaternions, (count, 4), means_m)
-    _check("scales_m", scales_m, (count, 3), means_m)
-    _check("opacities", opacities, (count,), means_m)
-    _check("colours", colours, (count, colours.shape[-1]), means_m)
-    _check("camera_from_world", camera_from_world, (4, 4), means_m)
+    _check_tensors(means_m, quaternions, scales_m, opacities, colours, camera_from_world)
+    if background is not None:
+        _check_background(background, colours, pinhole)
     if backend not in BACKENDS:
         raise ArgumentError(f"backend {backend!r} is not one of {', '.join(BACKENDS)}")
-    if not colours.shape[-1] > 0:
-        raise ArgumentError("colours must have at least one channel")
+    if not near_m > 0:
+        raise ArgumentError(f"near_m must be positive metres, got {near_m!r}")
+    if not threads >= 1:
+        raise ArgumentError(f"threads must be at least 1, got {threads!r}")
+    if not (pinhole.width >= 1 and pinhole.height >= 1):
+        raise ArgumentError(f"pinhole has no pixels: {pinhole.width}x{pinhole.height}")
     if backend == "gsplat" or (backend == "auto" and means_m.is_cuda):
         from weather_aug.gaussians.rasterise_cuda import drawn
     else:
         from weather_aug.gaussians.rasterise_cpu import drawn
-    blended, opacity, depth_sum, centres, radii = drawn(
+    blended = drawn(
         (means_m, quaternions, scales_m, opacities, colours, camera_from_world),
         pinhole,
         antialiased=antialiased,
         near_m=near_m,
         threads=threads,
     )
+    seen = blended.colours
     if background is not None:
-        blended = blended + (1.0 - opacity)[..., None] * background
-    depth_m = depth_sum / opacity.clamp_min(_LEAST_OPACITY)
-    return Drawn(blended, opacity, depth_m, centres, radii)
+        seen = seen + blended.left[..., None] * background
+    depth_m = blended.depth_sum_m / blended.opacity.clamp_min(_LEAST_OPACITY)
+    return Drawn(seen, blended.opacity, depth_m, blended.centres_px, blended.radii_px)
 
 
 _LEAST_OPACITY = 1e-8
 
 
+def _check_tensors(
+    means: Tensor,
+    quaternions: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colours: Tensor,
+    view: Tensor,
+) -> None:
+    count = means.shape[0] if isinstance(means, Tensor) and means.ndim else 0
+    _check("means_m", means, (count, 3), means)
+    _check("quaternions", quaternions, (count, 4), means)
+    _check("scales_m", scales, (count, 3), means)
+    _check("opacities", opacities, (count,), means)
+    channels = colours.shape[-1] if isinstance(colours, Tensor) and colours.ndim else 0
+    _check("colours", colours, (count, max(channels, 1)), means)
+    _check("camera_from_world", view, (4, 4), means)
+
+
+def _check_background(background: Tensor, colours: Tensor, pinhole: Pinhole) -> None:
+    channels = colours.shape[1]
+    whole = (pinhole.height, pinhole.width, channels)
+    is_flat = isinstance(background, Tensor) and background.ndim == 1
+    _check("background", background, (channels,) if is_flat else whole, colours)
+
+
 def _check(name: str, value: Tensor, shape: tuple[int, ...], like: Tensor) -> None:
+    if not isinstance(value, Tensor):
+        raise ArgumentError(f"{name} must be a tensor, got {type(value).__name__}")
     if tuple(value.shape) != shape:
         raise ArgumentError(f"{name} must have shape {shape}, got {tuple(value.shape)}")
     if value.dtype != torch.float32:

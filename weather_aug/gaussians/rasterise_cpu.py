@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -14,19 +15,35 @@ from torch import Tensor
 from weather_aug.errors import ArgumentError
 from weather_aug.gaussians import blend as kernels
 from weather_aug.gaussians import projection
-from weather_aug.gaussians.tiles import Tiles, tiles_of
+from weather_aug.gaussians.tiles import tiles_of
 from weather_aug.gaussians.types import Pinhole
 
 Tensors = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
-Array = NDArray[Any]
 
 _SHARES_PER_THREAD = 8
 """Tiles differ in their work; small shares even it out."""
 
 
+class Blended(NamedTuple):
+    """What a backend hands to `rasterise`."""
+
+    colours: Tensor
+    """(H, W, C), Σ w · colour."""
+    opacity: Tensor
+    """(H, W), Σ w."""
+    left: Tensor
+    """(H, W), the share of light that passes all splats."""
+    depth_sum_m: Tensor
+    """(H, W), Σ w · z."""
+    centres_px: Tensor
+    """(N, 2)."""
+    radii_px: Tensor
+    """(N,)."""
+
+
 def drawn(
     tensors: Tensors, pinhole: Pinhole, *, antialiased: bool, near_m: float, threads: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> Blended:
     """What `rasterise` asks a backend for.
 
     Args:
@@ -36,8 +53,6 @@ def drawn(
         near_m: See `rasterise`.
         threads: See `rasterise`.
 
-    Returns:
-        Blended colours (H, W, C), opacity and Σ w z (H, W), centres (N, 2), radii (N,).
     """
     if tensors[0].device.type != "cpu":
         raise ArgumentError("backend='cpu' draws tensors of the CPU; move them there")
@@ -50,9 +65,10 @@ def drawn(
     if centres.requires_grad:
         centres.retain_grad()
     shapes = torch.cat([centres, shapes[:, 2:]], dim=1)
-    planes = torch.cat([colours, depths[:, None]], dim=1)
+    # Opacity is summed up like a colour: one less the light that is left forgets faint splats.
+    planes = torch.cat([colours, depths[:, None], torch.ones_like(depths[:, None])], dim=1)
     blended, left = _Blend.apply(shapes, planes, depths, radii, pinhole, threads)
-    return blended[..., :-1], 1.0 - left, blended[..., -1], centres, radii
+    return Blended(blended[..., :-2], blended[..., -1], left, blended[..., -2], centres, radii)
 
 
 def lens_of(pinhole: Pinhole) -> NDArray[np.float64]:
@@ -151,8 +167,8 @@ class _Blend(torch.autograd.Function):
         parts = np.empty((len(tiles.order), projection.PARTS), np.float32)
         values = np.empty((len(tiles.order), channels), np.float32)
         kernels.gather(tiles.order, shapes.detach().numpy(), planes.detach().numpy(), parts, values)
-        left = torch.empty((height, width), dtype=torch.float32)
-        blended = torch.empty((height, width, channels), dtype=torch.float32)
+        left = np.empty((height, width), np.float32)
+        blended = np.empty((height, width, channels), np.float32)
         ends = np.empty(len(tiles.starts) - 1, np.int64)
 
         def share(first: int, last: int) -> None:
@@ -162,20 +178,22 @@ class _Blend(torch.autograd.Function):
                 tiles.starts,
                 tiles.ranks,
                 (first, last),
-                left.numpy(),
-                blended.numpy(),
+                left,
+                blended,
                 ends,
             )
 
         _shared(share, len(ends), threads)
-        ctx.save_for_backward(left, blended)
         ctx.lists = (tiles, parts, values, ends)
         ctx.count, ctx.threads = len(shapes), threads
-        return blended, left
+        pictures = (torch.from_numpy(blended), torch.from_numpy(left))
+        ctx.save_for_backward(*pictures)
+        return pictures
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
-        left, blended = ctx.saved_tensors
+        # Threads of the pool have a grad mode of their own; they see arrays only.
+        blended, left = (picture.detach().numpy() for picture in ctx.saved_tensors)
         tiles, parts, values, ends = ctx.lists
         has_shape = bool(ctx.needs_input_grad[0])
         d_blended, d_left = (grad.contiguous().numpy() for grad in grads)
@@ -192,8 +210,8 @@ class _Blend(torch.autograd.Function):
                 tiles.ranks,
                 (first, last),
                 ends,
-                left.numpy(),
-                blended.numpy(),
+                left,
+                blended,
                 d_left,
                 d_blended,
                 has_shape,
@@ -217,5 +235,5 @@ def _shared(work: Callable[[int, int], None], count: int, threads: int) -> None:
         return
     ends = np.linspace(0, count, threads * _SHARES_PER_THREAD + 1).astype(int)
     with ThreadPoolExecutor(threads) as pool:
-        for done in [pool.submit(work, a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]:
+        for done in [pool.submit(work, a, b) for a, b in pairwise(ends)]:
             done.result()

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from weather_aug._extras import require
 from weather_aug.errors import ArgumentError, MissingExtraError, printable
+from weather_aug.gaussians.rasterise_cpu import Blended, Tensors
 from weather_aug.gaussians.types import Pinhole
-
-Tensors = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 def drawn(
     tensors: Tensors, pinhole: Pinhole, *, antialiased: bool, near_m: float, threads: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> Blended:
     """What `rasterise` asks a backend for; see `rasterise_cpu.drawn`. `threads` does nothing.
 
     Raises:
@@ -58,4 +56,7 @@ def drawn(
         centres.retain_grad()
     radii = meta["radii"][0].float()
     radii = radii.amax(dim=-1) if radii.ndim == 2 else radii
-    return blended[0, ..., :-1], opacity[0, ..., 0], blended[0, ..., -1], centres[0], radii
+    opacity = opacity[0, ..., 0]
+    return Blended(
+        blended[0, ..., :-1], opacity, 1.0 - opacity, blended[0, ..., -1], centres[0], radii
+    )

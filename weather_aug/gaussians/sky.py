@@ -10,6 +10,8 @@ Convention:
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -36,9 +38,6 @@ LEARNING_RATE = 0.01
 """For Adam (OmniRe)."""
 UNKNOWN = 0.5
 """Of a map that nothing has been learnt about."""
-RIM_WEIGHT = 0.02
-"""Of a sky pixel beside what is no sky: it shows some of that, too, and counts where no other
-does."""
 
 
 class SkyMap(nn.Module):
@@ -79,14 +78,18 @@ class SkyMap(nn.Module):
             ArgumentError: If the size is no power of 2 up to 4096.
         """
         size = _checked_size(size)
-        sums = np.zeros((6 * size * size, 4), np.float32)
+        inner, rim = np.zeros((2, 6 * size * size, 4), np.float32)
         for frame in frames:
-            _gather(sums, frame, size)
+            _gather(inner, rim, frame)
+        # Pixels beside what is no sky show some of that, too: they tell where sky was seen, and
+        # its colour only if there are no others.
+        sums = (inner if inner.any() else rim).reshape(6, size, size, 4)
+        weights = sums[..., 3:]
+        colours = (sums[..., :3] / np.where(weights > 0, weights, 1)).astype(np.float32)
         sky = cls(size)
-        seen = (sums[:, 3] > 0).reshape(6, size, size)
         with torch.no_grad():
-            sky.faces.copy_(torch.from_numpy(_filled(sums.reshape(6, size, size, 4))))
-        sky.seen = torch.from_numpy(seen)
+            sky.faces.copy_(torch.from_numpy(_filled(colours, weights[..., 0] > 0)))
+        sky.seen = torch.from_numpy((inner + rim)[:, 3] > 0).reshape(6, size, size)
         return sky
 
     def colours(self, directions_world: Tensor) -> Tensor:
@@ -271,29 +274,31 @@ def _flat(sky: Sky) -> tuple[Float32, int]:
     return faces.reshape(-1, 3), faces.shape[1]
 
 
-def _gather(sums: Float32, frame: Frame, size: int) -> None:
-    """Add the colours of a frame's sky pixels, and their weights, to the flat texels (T, 4)."""
+def _gather(inner: Float32, rim: Float32, frame: Frame) -> None:
+    """Add the colours and the weights of a frame's sky pixels to flat texels (T, 4) of two maps.
+
+    The rim are those pixels that touch what is no sky.
+    """
     sky = _sky_of(frame)
     if not sky.any():
         return
+    table = table_of(math.isqrt(len(inner) // 6))
     # cv2 takes what is outside the picture for sky.
-    inner = cv2.erode(sky.astype(np.uint8), np.ones((3, 3), np.uint8))
-    weights = np.where(inner > 0, np.float32(1.0), np.float32(RIM_WEIGHT))
+    core = cv2.erode(sky.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     pinhole = Pinhole.of(frame.camera)
     matrix = _world_from_pixel(pinhole, frame.camera.world_from_camera)
     # Pixels wider than the texels in a corner of a face, a third of those in its middle, would
     # leave gaps.
-    steps = int(np.ceil(1.5 * size / min(pinhole.fx_px, pinhole.fy_px)))
-    weights /= np.float32(steps**2)
-    values = np.empty((*sky.shape, 4), np.float32)
-    values[..., :3] = frame.image.astype(np.float32) * (weights / np.float32(255.0))[..., None]
-    values[..., 3] = weights
+    steps = math.ceil(1.5 * (table.shape[1] - 2) / min(pinhole.fx_px, pinhole.fy_px))
+    values = np.ones((sky.size, 4), np.float32)
+    values[:, :3] = frame.image.reshape(-1, 3) / np.float32(255.0)
+    values /= np.float32(steps**2)
     shifts = (np.arange(steps) + 0.5) / steps - 0.5
-    for down in shifts:
-        for across in shifts:
-            shift = np.array([[1, 0, across], [0, 1, down], [0, 0, 1]])
-            moved = (matrix @ shift).astype(np.float32)
-            sky_kernels.scatter_picture(values.reshape(-1, 4), table_of(size), moved, sky, sums)
+    for across, down in itertools.product(shifts, shifts):
+        shift = np.array([[1, 0, across], [0, 1, down], [0, 0, 1]])
+        moved = (matrix @ shift).astype(np.float32)
+        sky_kernels.scatter_picture(values, table, moved, core, inner)
+        sky_kernels.scatter_picture(values, table, moved, sky & ~core, rim)
 
 
 def _sky_of(frame: Frame) -> Bools:
@@ -304,23 +309,21 @@ def _sky_of(frame: Frame) -> Bools:
     return np.zeros(frame.image.shape[:2], bool)
 
 
-def _filled(sums: Float32) -> Float32:
-    """(6, S, S, 3) mean colours of sums (6, S, S, 4); unseen texels from maps of half the size."""
-    size = sums.shape[1]
-    weights = sums[..., 3:]
-    seen = weights[..., 0] > 0
-    colours = (sums[..., :3] / np.where(weights > 0, weights, 1)).astype(np.float32)
-    if seen.all():
+def _filled(colours: Float32, known: Bools) -> Float32:
+    """(6, S, S, 3) colours with unknown texels from maps of half the size, in turn."""
+    size = known.shape[1]
+    colours = np.where(known[..., None], colours, np.float32(0.0))
+    if known.all():
         return colours
     if size == 1:
-        colours[~seen] = colours[seen].mean(axis=0) if seen.any() else UNKNOWN
+        colours[~known] = colours[known].mean(axis=0) if known.any() else UNKNOWN
         return colours
-    # Each seen texel counts the same, however often it was seen.
-    plain = np.concatenate([colours, seen[..., None].astype(np.float32)], axis=-1)
-    plain[~seen] = 0.0
-    coarse = _filled(plain.reshape(6, size // 2, 2, size // 2, 2, 4).sum(axis=(2, 4)))
-    unseen = np.ascontiguousarray(texel_directions(size)[~seen])
-    filled = np.empty_like(unseen)
-    sky_kernels.sample(coarse.reshape(-1, 3), table_of(size // 2), unseen, filled)
-    colours[~seen] = filled
+    blocks = (6, size // 2, 2, size // 2, 2)
+    counts = known.reshape(blocks).sum(axis=(2, 4))
+    means = colours.reshape(*blocks, 3).sum(axis=(2, 4)) / np.maximum(counts, 1)[..., None]
+    coarse = _filled(means.astype(np.float32), counts > 0)
+    unknown = np.ascontiguousarray(texel_directions(size)[~known])
+    filled = np.empty_like(unknown)
+    sky_kernels.sample(coarse.reshape(-1, 3), table_of(size // 2), unknown, filled)
+    colours[~known] = filled
     return colours

@@ -69,7 +69,7 @@ def _spans(parts, order, rows, firsts, spans):
     for i in range(order.shape[0]):
         part = parts[order[i]]
         a, b, c = float(part[2]), float(part[3]), float(part[4])
-        high = math.sqrt(_reach(part) * a / (a * c - b * b))
+        high = math.sqrt(_reach(part) * a / _determinant(a, b, c))
         first = max(math.floor((float(part[1]) - high) / TILE_PX), 0)
         last = min(math.floor((float(part[1]) + high) / TILE_PX), rows - 1)
         firsts[i] = first
@@ -77,6 +77,12 @@ def _spans(parts, order, rows, firsts, spans):
         total += max(int(last - first) + 1, 0)
     spans[order.shape[0]] = total
     return total
+
+
+@inlined
+def _determinant(a, b, c):
+    """Of a conic; single precision leaves nothing, or less, of a very long needle's."""
+    return max(a * c - b * b, 1e-7 * a * c)
 
 
 @inlined
@@ -92,7 +98,7 @@ def _count(parts, order, columns, firsts, spans, touched, counts):
         part = parts[order[i]]
         u, v = float(part[0]), float(part[1])
         a, b, c = float(part[2]), float(part[3]), float(part[4])
-        area = a * c - b * b
+        area = _determinant(a, b, c)
         reach = _reach(part)
         wide = math.sqrt(reach * c / area)
         # Half a pixel of margin: the kernel decides on each pixel by itself.

@@ -27,6 +27,9 @@ def mapped(path: Path, dtype: str, shape: tuple[int, ...]) -> NDArray[Any]:
     try:
         with path.open("rb") as file:
             start = file.read(len(header))
+            # Nothing can be mapped of an array without values.
+            if start == header and 0 in shape:
+                return np.zeros(shape, dtype)
         array = np.memmap(path, dtype, "r", len(header), shape) if start == header else None
     except (OSError, ValueError) as error:
         raise SceneError(f"{printable(path, 200)} cannot be read: {printable(error)}") from None

@@ -1,4 +1,4 @@
-"""Rounds over the frames of a clip that go on where they were cut short."""
+"""Rounds over the frames of a clip, or over other steps, that go on where they were cut short."""
 
 from __future__ import annotations
 
@@ -9,16 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from weather_aug import _files
-from weather_aug.clip.types import FrameKey
 
 Record = dict[str, Any]
-"""Of a frame that is done: `entry` is what the manifest says of it, `files` the size and digest of
+"""Of a step that is done: `entry` is what the manifest says of it, `files` the size and digest of
 each of its files by relative path."""
 
 
 @dataclass(frozen=True)
 class Round:
-    """One thing that is made of every frame, in the order of `keys`."""
+    """One thing that is made of every frame, or by other named steps, in the order of `keys`."""
 
     title: str
     """Beside the bar."""
@@ -26,11 +25,17 @@ class Round:
     """Name of the file that lists what is done."""
     head: dict[str, Any]
     """What all of it depends on; work of another head is thrown away. JSON values."""
-    keys: Sequence[FrameKey]
-    make: Callable[[FrameKey], tuple[dict[str, Any], dict[str, bytes]]]
-    """The manifest's entry for a frame, and bytes by relative path: always the same."""
+    keys: Sequence[Any]
+    """Of the frames, or names of the steps; their texts differ."""
+    make: Callable[[Any], tuple[dict[str, Any], dict[str, bytes]]]
+    """The manifest's entry for a step, and bytes by relative path: always the same."""
     clean: Callable[[Path], None]
     """Make the work folder as it is before the round."""
+    unit: str = "frame"
+    """Of the bar."""
+    tries_first: bool = True
+    """Make the first finished step once more, to see what the head cannot tell. Not for steps of
+    many minutes whose head tells it all."""
 
 
 def make_all(task: Round, work: Path, progress: bool) -> dict[str, Record]:
@@ -43,7 +48,7 @@ def make_all(task: Round, work: Path, progress: bool) -> dict[str, Record]:
 
     done = _finished(task, work)
     with _files.reported(work), (work / task.journal).open("a", encoding="utf-8") as journal:
-        for key in tqdm(task.keys, desc=task.title, unit="frame", disable=not progress):
+        for key in tqdm(task.keys, desc=task.title, unit=task.unit, disable=not progress):
             if str(key) in done:
                 continue
             record, parts = _made(task, key)
@@ -60,7 +65,7 @@ def digest_record(data: bytes) -> dict[str, Any]:
     return {"size": len(data), "sha256": _files.sha256_of(data)}
 
 
-def _made(task: Round, key: FrameKey) -> tuple[Record, dict[str, bytes]]:
+def _made(task: Round, key: Any) -> tuple[Record, dict[str, bytes]]:
     entry, parts = task.make(key)
     files = {relative: digest_record(data) for relative, data in parts.items()}
     return {"entry": entry, "files": files}, parts
@@ -69,9 +74,9 @@ def _made(task: Round, key: FrameKey) -> tuple[Record, dict[str, bytes]]:
 def _finished(task: Round, work: Path) -> dict[str, Record]:
     """What interrupted work of this round has finished; else a clean work folder."""
     done = _read(task, work)
-    # The head cannot tell all that the frames depend on; a frame made again can.
+    # The head may not tell all that the steps depend on; a step made again can.
     first = next((key for key in task.keys if str(key) in done), None)
-    if first is not None:
+    if first is not None and task.tries_first:
         record, _ = _made(task, first)
         done = done if json.dumps(record) == json.dumps(done[str(first)]) else {}
     if not done:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,9 @@ from weather_aug.particles.shelter import CELL_M
 from weather_aug.scene.layers import PARTS as LAYER_PARTS
 from weather_aug.scene.layers import LayersRecord, Street, parse_layers
 from weather_aug.scene.route import route_of
+
+if TYPE_CHECKING:
+    from weather_aug.scene.reconstruction import ReconstructionRecord
 
 FRAMES = "frames"
 SHELTER = "shelter.npy"
@@ -78,6 +81,8 @@ class Manifest:
     frames: tuple[FrameRecord, ...]
     files: Mapping[str, StoredFile]
     shelter: ShelterRecord | None = None
+    reconstruction: ReconstructionRecord | None = None
+    """None in a scene that was built without Gaussians."""
     digest: str = ""
     """SHA-256 of the manifest's bytes; it names the scene's content, since it lists all digests."""
     by_key: Mapping[FrameKey, FrameRecord] = field(init=False)

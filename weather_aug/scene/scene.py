@@ -2,28 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from weather_aug.clip.types import Clip, Frame, FrameKey, Window
+from weather_aug._checks import finite
+from weather_aug.clip.types import Camera, Clip, Frame, FrameKey, Window
 from weather_aug.edit.ambience import Ambience
 from weather_aug.edit.physical.layers import Layers
 from weather_aug.errors import ArgumentError, IntegrityError, printable
+from weather_aug.gaussians.types import Reconstruction
 from weather_aug.particles.shelter import Shelter
 from weather_aug.render.compose import RenderedFrame, render
 from weather_aug.render.fields import RigMotion
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene import store
 from weather_aug.scene.layers import Street, layers_seen
+from weather_aug.scene.reconstruction import read_reconstruction
 from weather_aug.scene.records import FrameRecord, Manifest, streets
+from weather_aug.scene.viewpoint import Viewpoint, raised_height_m
 from weather_aug.timeline import WeatherTimeline
 from weather_aug.weather import Weather
 
 if TYPE_CHECKING:
     from weather_aug.air import Air
+    from weather_aug.gaussians.gather import Weights
+    from weather_aug.scene.novel import NovelFrame, Poses
 
 
 class WeatherScene:
@@ -118,11 +124,14 @@ class WeatherScene:
         The airlight is the clip's too if it is a drive: fog does not flicker. Of unrelated pictures
         each has its own.
         """
+        return self._ambience(key, 0.0)
+
+    def _ambience(self, key: FrameKey, raised_m: float) -> Ambience:
         key = FrameKey(*key)
         light = dict(self._record(key).light)
         if self.manifest.airlight is not None:
             light["airlight"] = self.manifest.airlight
-        height_m = self.manifest.camera_height_m(key.camera)
+        height_m = raised_height_m(self.manifest.camera_height_m(key.camera), raised_m)
         return Ambience(self.manifest.axes_world, **light, camera_height_m=height_m)
 
     @cached_property
@@ -134,6 +143,16 @@ class WeatherScene:
         """
         return store.read_shelter(self.path, self.manifest)
 
+    @cached_property
+    def reconstruction(self) -> Reconstruction | None:
+        """The drive as Gaussians, memory-mapped; None if the scene was built without.
+
+        Raises:
+            SceneError: If a file of it cannot be read any more, or holds what no scene can.
+        """
+        record = self.manifest.reconstruction
+        return None if record is None else read_reconstruction(self.path, record)
+
     def layers(self, key: FrameKey) -> Layers:
         """What the editor knows of a frame: read from the scene, or found out if it is of before.
 
@@ -143,7 +162,7 @@ class WeatherScene:
         """
         record = self._record(key)
         if record.layers is None:
-            return self._layers_of(self.frame(key))
+            return self._looked_at(self.frame(key))
         _, label = store.read_surfaces(self.path, record)
         layers = store.read_layers(self.path, record, label)
         assert layers is not None
@@ -151,7 +170,12 @@ class WeatherScene:
 
     def _layers_of(self, frame: Frame) -> Layers:
         stored = store.read_layers(self.path, self._record(frame.key), frame.label)
-        return stored or layers_seen(frame, self._streets[frame.key.camera])
+        return stored or self._looked_at(frame)
+
+    def _looked_at(self, frame: Frame) -> Layers:
+        street = self._streets[frame.key.camera]
+        height_m = raised_height_m(street.camera_height_m, self._raised_m(frame))
+        return layers_seen(frame, street._replace(camera_height_m=height_m))
 
     @cached_property
     def _streets(self) -> dict[str, Street]:
@@ -167,9 +191,22 @@ class WeatherScene:
         seed: int = 0,
         window: Window | None = None,
         air: Air | None = None,
+        viewpoint: Viewpoint | None = None,
+        style: str | Weights | None = None,
+        amount: float = 1.0,
+        without_actors: Collection[int] = (),
+        poses: Poses | None = None,
         options: RenderOptions = DEFAULT_OPTIONS,
     ) -> RenderedFrame:
         """Render one frame in a weather; see `weather_aug.render.compose.render`.
+
+        A viewpoint, a style, or actors that are left out or put elsewhere make it a frame that was
+        never recorded, drawn from the scene's Gaussians (see `frame_from`): what no recorded frame
+        showed has the label 255, and is invalid. There are two ways to its background. Without a
+        style the editor dresses the picture, as it does recorded ones. A style shows its weather
+        already: the effects on surfaces (`scene.novel.CARRIED`) are left out, whatever the weather
+        says of the ground; air, particles, light on them, spray, lamps, glass and sensor follow the
+        weather, and labels are buried under the style's snow.
 
         Args:
             key: Which frame, one of `keys`.
@@ -178,11 +215,50 @@ class WeatherScene:
             window: (top, left, height, width); the whole picture if None.
             air: How the air moves and has moved since the clip's start; if None, as the weather
                 tells.
+            viewpoint: Where the camera stands, from the recorded one.
+            style: A weather's colours that the Gaussians take, or weights of several.
+            amount: In 0..1, of the style.
+            without_actors: Track ids of moving objects to leave out.
+            poses: (4, 4) `world_from_actor` by track id: moving objects put elsewhere.
             options: Choices besides the weather.
+
+        Raises:
+            ArgumentError: If an argument is none, or Gaussians are needed and the scene has none.
+            SceneError: If a file of the scene cannot be read any more.
         """
         if not isinstance(options, RenderOptions):
             raise ArgumentError(f"options must be RenderOptions, got {type(options).__name__}")
-        frame = self.frame(key)
+        if viewpoint is None and style is None and not without_actors and not poses:
+            look = self._layers_of
+            return self._rendered(self.frame(key), look, weather, seed, window, air, options)
+        # Loads torch.
+        from weather_aug.scene.novel import carried_options, honest, lying_in
+
+        novel = self.frame_from(
+            key,
+            viewpoint,
+            style=style,
+            amount=amount,
+            without=without_actors,
+            poses=poses,
+            normals=False,
+        )
+        dressing = options if style is None else carried_options(options)
+        look = self._looked_at
+        shot = self._rendered(novel.frame, look, weather, seed, window, air, dressing)
+        return honest(shot, novel, lying_in(style, amount), options)
+
+    def _rendered(
+        self,
+        frame: Frame,
+        look: Callable[[Frame], Layers],
+        weather: Weather | WeatherTimeline,
+        seed: int,
+        window: Window | None,
+        air: Air | None,
+        options: RenderOptions,
+    ) -> RenderedFrame:
+        """A frame in a weather; `look` tells what the editor knows of it."""
         frame = replace(frame, time_s=frame.time_s - self.manifest.frames[0].time_s)
         if isinstance(weather, WeatherTimeline):
             air = air or weather.air(frame.time_s, seed)
@@ -193,14 +269,90 @@ class WeatherScene:
             frame,
             weather,
             seed=seed,
-            ambience=self.ambience(key),
+            ambience=self._ambience(frame.key, self._raised_m(frame)),
             window=window,
             air=air,
             shelter=self.shelter,
             rig=self._rig_motion(frame.key) if options.needs_rig else None,
-            layers=self._layers_of(frame) if is_seen else None,
+            layers=look(frame) if is_seen else None,
             options=options,
         )
+
+    def frame_from(
+        self,
+        key: FrameKey,
+        viewpoint: Viewpoint | None = None,
+        *,
+        camera: Camera | None = None,
+        time_s: float | None = None,
+        style: str | Weights | None = None,
+        amount: float = 1.0,
+        without: Collection[int] = (),
+        poses: Poses | None = None,
+        normals: bool = True,
+    ) -> NovelFrame:
+        """A frame that nobody recorded, drawn from the scene's Gaussians.
+
+        Args:
+            key: The recorded frame that it starts from: its camera's lens, its exposure, the boxes
+                of what stands, and its moment.
+            viewpoint: Where the camera stands, from the recorded one; at its place if None.
+            camera: Any camera instead.
+            time_s: Another moment, in seconds since the first frame, of what moves.
+            style: A weather's colours, or weights of several.
+            amount: In 0..1, of the style.
+            without: Track ids of moving objects to leave out.
+            poses: (4, 4) `world_from_actor` by track id: moving objects put elsewhere.
+            normals: Whether the frame has them; they take time.
+
+        Returns:
+            The frame with depth, label where the scene is labelled, and boxes, and which of its
+            pixels recorded frames showed; all of them where that was not stored.
+
+        Raises:
+            ArgumentError: If the scene has no Gaussians or no such frame, both viewpoint and camera
+                are given, or a style or a track is unknown.
+            SceneError: If a file of the scene cannot be read any more.
+        """
+        from weather_aug.scene.novel import PLANES, novel_camera, novel_frame
+
+        reconstruction = self._gaussians()
+        record = self._record(key)
+        if camera is not None and viewpoint is not None:
+            raise ArgumentError("give a viewpoint or a camera, not both")
+        if viewpoint is not None and not isinstance(viewpoint, Viewpoint):
+            raise ArgumentError(
+                f"viewpoint must be a Viewpoint, got {type(viewpoint).__name__}; write "
+                "Viewpoint(lateral_m=1.0)"
+            )
+        recorded = store.read_frame(self.path, record)
+        if camera is None:
+            axes_world = self.manifest.axes_world
+            camera = novel_camera(reconstruction, recorded, axes_world, viewpoint or Viewpoint())
+        return novel_frame(
+            reconstruction,
+            recorded,
+            camera,
+            recorded.time_s if time_s is None else finite("time_s", time_s),
+            style=style,
+            amount=amount,
+            without=without,
+            poses=poses,
+            want=PLANES if normals else PLANES[:-1],
+        )
+
+    def _gaussians(self) -> Reconstruction:
+        if self.reconstruction is None:
+            raise ArgumentError(
+                f"scene {self.name} has no Gaussians to be seen from elsewhere; build it again "
+                "with reconstruct=True (weather-aug build … --reconstruct)"
+            )
+        return self.reconstruction
+
+    def _raised_m(self, frame: Frame) -> float:
+        """How much higher a frame's camera stands than the recorded one."""
+        here, there = frame.camera, self._record(frame.key).camera
+        return float(self.manifest.axes_world[2] @ (here.centre_world - there.centre_world))
 
     def _rig_motion(self, key: FrameKey) -> RigMotion:
         """Of the clip's first camera up to the moment of a frame, or to the last one before it."""

@@ -7,6 +7,8 @@
     frames/000012_front.boxes.json      tracked boxes, where there are any
     frames/000012_front.layers.npy …    what the editor knows of it; see `weather_aug.scene.layers`
     shelter.npy                         (A, L) float32 undersides over the street, if there are any
+    gaussians/…                         the drive as Gaussians, if they were asked for; see
+                                        `weather_aug.scene.reconstruction`
 
 Data only: nothing in it can run code, every file has its size and SHA-256 in the manifest, and the
 manifest has its own.
@@ -35,6 +37,7 @@ from weather_aug.scene.arrays import mapped, npy_bytes
 from weather_aug.scene.boxes import encode_boxes, read_boxes
 from weather_aug.scene.layers import PARTS as LAYER_PARTS
 from weather_aug.scene.layers import read_layers as stored_layers
+from weather_aug.scene.reconstruction import parse_reconstruction
 from weather_aug.scene.records import (
     LIGHTS,
     SHELTER,
@@ -315,5 +318,7 @@ def _parse(content: Any, path: Path) -> Manifest:
         frames=frames,
         files=files,
         shelter=parse_shelter(content.get("shelter"), files),
+        # Scenes of before there were any, or built without, have none.
+        reconstruction=parse_reconstruction(content.get("reconstruction"), files),
         digest=_files.sha256_of_file(path),
     )

@@ -20,6 +20,7 @@ from weather_aug.render.label_weight import loss_weight_of
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene.policy import WeatherDraw, WeatherPolicy
 from weather_aug.scene.scene import WeatherScene
+from weather_aug.scene.viewpoint import Viewpoint, ViewpointJitter
 from weather_aug.taxonomy import SKY
 
 Sample = dict[str, Any]
@@ -37,7 +38,10 @@ class WeatherDataset(Dataset[Any]):
         cannot be made out (see `RenderedFrame`), `transmittance` in [0, 1] and `depth` in metres
         (H, W) float32, and `recipe`, a JSON text from which the item can be rendered again. Scenes
         without labels give items without `label` and `label_full`; all frames have labels, or none.
-        `loss_weight(item)` gives weights for a loss, of a batch as well.
+        `loss_weight(item)` gives weights for a loss, of a batch as well. With `viewpoint_jitter`
+        image, label and depth are drawn from the scenes' Gaussians, each item from beside its
+        recorded camera, and what was never recorded is 255 in both labels, and invalid; the
+        weathers drawn are the same as without.
 
     Args:
         scenes: One or more scenes.
@@ -47,10 +51,13 @@ class WeatherDataset(Dataset[Any]):
             `label_full` (H, W) uint8, …); what it returns is the item.
         crop: (height, width) of a random part to render; only that part is rendered.
         options: Budget of the renderer.
+        viewpoint_jitter: How far beside the recorded cameras pictures are taken; None takes the
+            recorded pictures.
 
     Raises:
         ArgumentError: If there are no scenes, some of their frames have labels and some have none,
-            the policy is none, or a frame is smaller than the crop.
+            the policy is none, a frame is smaller than the crop, or viewpoints are asked for and a
+            scene has no Gaussians.
     """
 
     def __init__(
@@ -62,6 +69,7 @@ class WeatherDataset(Dataset[Any]):
         transform: Callable[[Sample], Any] | None = None,
         crop: tuple[int, int] | None = None,
         options: RenderOptions = DEFAULT_OPTIONS,
+        viewpoint_jitter: ViewpointJitter | None = None,
     ) -> None:
         if isinstance(scenes, WeatherScene):
             raise ArgumentError("scenes must be a sequence; write WeatherDataset([scene], ...)")
@@ -73,13 +81,20 @@ class WeatherDataset(Dataset[Any]):
         self.transform = transform
         self.crop = crop
         self.options = options
+        self.viewpoint_jitter = viewpoint_jitter
         self._ends = np.cumsum([len(scene.keys) for scene in self.scenes])
         # Shared memory, because persistent workers hold a copy of everything else.
         self._epoch = torch.zeros(1, dtype=torch.int64).share_memory_()
         self._check_labels()
         self._check_crop()
+        self._check_viewpoints()
         if get_worker_info() is None:
             warm_up()
+            if viewpoint_jitter is not None:
+                # Recorded frames alone do without what draws Gaussians.
+                from weather_aug.scene.novel import warm_up as warm_up_views
+
+                warm_up_views()
 
     def __len__(self) -> int:
         return int(self._ends[-1])
@@ -105,8 +120,16 @@ class WeatherDataset(Dataset[Any]):
         scene, key = self._locate(index)
         draw = self.policy.draw(self.seed, self.epoch, index)
         window = self._window(scene, key, index)
-        shot = scene.render(key, draw.weather, seed=draw.seed, window=window, options=self.options)
-        sample = _sample(shot, _recipe(scene, key, draw, window, self.options))
+        viewpoint = self._viewpoint(index)
+        shot = scene.render(
+            key,
+            draw.weather,
+            seed=draw.seed,
+            window=window,
+            viewpoint=viewpoint,
+            options=self.options,
+        )
+        sample = _sample(shot, _recipe(scene, key, draw, window, viewpoint, self.options))
         return _tensors(sample) if self.transform is None else self.transform(sample)
 
     def _checked(self, index: int) -> int:
@@ -130,6 +153,26 @@ class WeatherDataset(Dataset[Any]):
         top = int(down * (height - rows + 1))
         left = int(right * (width - columns + 1))
         return (top, left, rows, columns)
+
+    def _viewpoint(self, index: int) -> Viewpoint | None:
+        if self.viewpoint_jitter is None:
+            return None
+        return self.viewpoint_jitter.draw(key_of("viewpoint", self.seed, self.epoch, index))
+
+    def _check_viewpoints(self) -> None:
+        if self.viewpoint_jitter is None:
+            return
+        if not isinstance(self.viewpoint_jitter, ViewpointJitter):
+            raise ArgumentError(
+                "viewpoint_jitter must be a ViewpointJitter, got "
+                f"{type(self.viewpoint_jitter).__name__}; write ViewpointJitter(lateral_m=1.0)"
+            )
+        for scene in self.scenes:
+            if scene.manifest.reconstruction is None:
+                raise ArgumentError(
+                    f"scene {scene.name} has no Gaussians to be seen from elsewhere; build it "
+                    "again with reconstruct=True, or leave viewpoint_jitter out"
+                )
 
     def _check_labels(self) -> None:
         """Refuse a mixture: its items differ in their keys, and no batch could hold two of them."""
@@ -230,17 +273,19 @@ def _recipe(
     key: Any,
     draw: WeatherDraw,
     window: Window | None,
+    viewpoint: Viewpoint | None,
     options: RenderOptions,
 ) -> str:
-    return json.dumps(
-        {
-            "scene": scene.name,
-            "scene_digest": scene.digest,
-            "time_index": key.time_index,
-            "camera": key.camera,
-            "weather": draw.weather.to_dict(),
-            "seed": draw.seed,
-            "window": window,
-            "options": options.to_dict(),
-        }
-    )
+    recipe = {
+        "scene": scene.name,
+        "scene_digest": scene.digest,
+        "time_index": key.time_index,
+        "camera": key.camera,
+        "weather": draw.weather.to_dict(),
+        "seed": draw.seed,
+        "window": window,
+        "options": options.to_dict(),
+    }
+    if viewpoint is not None:
+        recipe["viewpoint"] = viewpoint.to_dict()
+    return json.dumps(recipe)

@@ -17,6 +17,7 @@ from weather_aug.errors import SceneError, printable
 from weather_aug.render.compose import RenderedFrame
 from weather_aug.render.options import RenderOptions
 from weather_aug.scene.scene import WeatherScene
+from weather_aug.scene.viewpoint import Viewpoint
 from weather_aug.taxonomy import CLASSES
 from weather_aug.weather import Weather
 from weather_aug.writers.plan import ExportPlan
@@ -26,7 +27,7 @@ def render_recipe(scene: WeatherScene, recipe: Mapping[str, Any]) -> RenderedFra
     """Render the sample that a recipe of an export's manifest or of a data set describes.
 
     A recipe's `window`, (top, left, height, width) in pixels, may be null or absent: the whole
-    picture.
+    picture; its `viewpoint`, an object of lengths and angles, may be too: the recorded one.
 
     Raises:
         SceneError: If the scene is not the recipe's, or a file of it cannot be read.
@@ -37,12 +38,13 @@ def render_recipe(scene: WeatherScene, recipe: Mapping[str, Any]) -> RenderedFra
             f"{scene.digest[:12]}…, the recipe's {printable(recipe['scene_digest'], 12)}"
         )
     key = FrameKey(recipe["time_index"], recipe["camera"])
-    window = recipe.get("window")
+    window, viewpoint = recipe.get("window"), recipe.get("viewpoint")
     return scene.render(
         key,
         Weather.from_dict(recipe["weather"]),
         seed=recipe["seed"],
         window=None if window is None else tuple(window),
+        viewpoint=None if viewpoint is None else Viewpoint.from_dict(viewpoint),
         options=RenderOptions(**recipe["options"]),
     )
 

@@ -1,0 +1,232 @@
+"""Frames that no camera took: a reconstructed drive from beside the way, at any moment."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import fields, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from weather_aug.clip.types import MAX_SPEED_M_PER_S, Box, Camera, Frame
+from weather_aug.gaussians.actors import pose_at
+from weather_aug.gaussians.draw import View, view
+from weather_aug.gaussians.gather import Weights, camera_of
+from weather_aug.gaussians.types import Actor, Gaussians, Reconstruction, Sky
+from weather_aug.render.compose import RenderedFrame
+from weather_aug.render.label import kept_labels
+from weather_aug.render.label_snow import buried_borders, covered_faces, snow_limits
+from weather_aug.render.options import RenderOptions
+from weather_aug.scene.policy import TYPES, weather_of
+from weather_aug.scene.viewpoint import Viewpoint, moved
+from weather_aug.taxonomy import IGNORE
+from weather_aug.weather import Weather
+
+Float64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Poses = Mapping[int, ArrayLike]
+
+CARRIED = (*("relight", "sky", "film", "mirror", "puddles", "ripples", "snow_cover", "tracks"),)
+"""Effects on surfaces: a style of the Gaussians has them already."""
+PLANES = ("image", "depth", "label", "seen", "normals")
+"""Of a novel frame; only the last can be done without."""
+STYLE_SEVERITY = "heavy"
+"""Of the weather that styles are fitted to; `amount` goes from none of it to all."""
+AT_ITS_TIME_S = 1e-3
+"""A frame so near in time is the recorded moment."""
+
+
+class NovelFrame(NamedTuple):
+    """A frame drawn from Gaussians."""
+
+    frame: Frame
+    """Its label is 255 where the drive never showed what is there."""
+    seen: Mask
+    """(H, W): recorded frames showed what is there."""
+
+
+def style_weather(name: str) -> Weather | None:
+    """What lies on the ground and covers the sky in a style: its weather, with nothing in the air.
+
+    None for a style whose name is no type of weather.
+    """
+    if name not in TYPES:
+        return None
+    weather = weather_of(name, STYLE_SEVERITY, falling=False)
+    air = Weather.clear()
+    in_the_air = ("visibility_m", "fog_scale_height_m", "mist_per_km", "spray_per_km", "lamps")
+    return replace(weather, **{field: getattr(air, field) for field in in_the_air})
+
+
+def lying_in(style: str | Weights | None, amount: float) -> Weather:
+    """The snow on the ground of a style, or of a mixture of styles; all else is clear."""
+    if style is None:
+        return Weather.clear()
+    weights = {style: 1.0} if isinstance(style, str) else style
+    known = [(share, style_weather(name)) for name, share in weights.items()]
+    snow = {
+        name: sum(amount * share * getattr(weather, name) for share, weather in known if weather)
+        for name in ("snow_cover", "road_snow_cover", "snow_depth_m")
+    }
+    return replace(Weather.clear(), **snow)
+
+
+def novel_camera(
+    reconstruction: Reconstruction, recorded: Frame, axes_world: Float64, viewpoint: Viewpoint
+) -> Camera:
+    """The camera of a recorded frame, refined where it was, at a viewpoint."""
+    return moved(camera_of(reconstruction, recorded), axes_world, viewpoint)
+
+
+def novel_frame(
+    reconstruction: Reconstruction,
+    recorded: Frame,
+    camera: Camera,
+    time_s: float,
+    *,
+    style: str | Weights | None = None,
+    amount: float = 1.0,
+    without: Collection[int] = (),
+    poses: Poses | None = None,
+    want: Collection[str] = PLANES,
+) -> NovelFrame:
+    """What `camera` would have taken at `time_s`.
+
+    Args:
+        reconstruction: The drive.
+        recorded: The frame whose exposure the picture has, and whose boxes nobody tracked further.
+        camera: Any.
+        time_s: In the clip's time.
+        style: A weather's colours, or weights of several.
+        amount: In 0..1, of the style.
+        without: Track ids of actors to leave out.
+        poses: (4, 4) `world_from_actor` by track id: actors put elsewhere.
+        want: Which planes to draw, as of `gaussians.draw.view`; the first four are needed.
+
+    Raises:
+        ArgumentError: If a style or a track is unknown, or a number leaves its range.
+    """
+    key = recorded.key
+    shown = view(
+        reconstruction,
+        camera,
+        time_s,
+        style=style,
+        amount=amount,
+        without=without,
+        poses=poses,
+        key=key if key in reconstruction.exposures else None,
+        want=want,
+    )
+    seen = np.ones(shown.opacity.shape, bool) if shown.seen is None else shown.seen
+    label = None if shown.label is None else np.where(seen, shown.label, np.uint8(IGNORE))
+    boxes = boxes_at(reconstruction.actors, recorded, time_s, without, poses or {})
+    assert shown.image is not None
+    frame = Frame(
+        key, time_s, camera, shown.image, label, _stored_depth(shown), shown.normals_world, boxes
+    )
+    return NovelFrame(frame, seen)
+
+
+def _stored_depth(shown: View) -> NDArray[np.float16]:
+    """As a scene stores it, so that kernels need not be compiled for another type."""
+    assert shown.depth_m is not None
+    with np.errstate(over="ignore"):
+        return shown.depth_m.astype(np.float16)
+
+
+def boxes_at(
+    actors: Sequence[Actor],
+    recorded: Frame,
+    time_s: float,
+    without: Collection[int],
+    poses: Poses,
+) -> tuple[Box, ...]:
+    """Boxes of what is there: first all that was recorded and is no actor, then the actors.
+
+    An actor's velocity is the recorded box's at its moment, else its track's; of one put elsewhere
+    it turns with it.
+    """
+    tracks = {actor.track_id for actor in actors}
+    standing = [box for box in recorded.boxes if box.track_id not in tracks]
+    moving = [
+        _box_of(actor, recorded, time_s, poses.get(actor.track_id))
+        for actor in actors
+        if actor.track_id not in without
+    ]
+    return (*standing, *(box for box in moving if box is not None))
+
+
+def _box_of(actor: Actor, recorded: Frame, time_s: float, put: ArrayLike | None) -> Box | None:
+    pose = pose_at(actor, time_s)
+    velocity = None if pose is None else _velocity_of(actor, recorded, time_s)
+    if put is not None:
+        there = np.asarray(put, np.float64)
+        if pose is not None and velocity is not None:
+            velocity = there[:3, :3] @ pose[:3, :3].T @ velocity
+        pose = there
+    if pose is None:
+        return None
+    return Box(actor.track_id, actor.class_name, pose, actor.size_m, velocity)
+
+
+def _velocity_of(actor: Actor, recorded: Frame, time_s: float) -> Float64 | None:
+    """(3,) m/s of an actor in the world; None where neither box nor track tell."""
+    if abs(time_s - recorded.time_s) <= AT_ITS_TIME_S:
+        for box in recorded.boxes:
+            if box.track_id == actor.track_id:
+                return box.velocity_m_per_s
+    times_s, places = actor.times_s, actor.world_from_actor[:, :3, 3]
+    before = max(int(np.searchsorted(times_s, time_s, side="left")) - 1, 0)
+    after = min(int(np.searchsorted(times_s, time_s, side="right")), len(times_s) - 1)
+    if before >= after:
+        return None
+    velocity = (places[after] - places[before]) / (times_s[after] - times_s[before])
+    return velocity if np.linalg.norm(velocity) <= MAX_SPEED_M_PER_S else None
+
+
+def carried_options(options: RenderOptions) -> RenderOptions:
+    """Without what a style's colours show already: the editor would dress the street twice."""
+    return replace(options, without=(*options.without, *CARRIED))
+
+
+def honest(
+    shot: RenderedFrame, novel: NovelFrame, lying: Weather, options: RenderOptions
+) -> RenderedFrame:
+    """The render of a novel frame with what its label cannot claim.
+
+    Args:
+        shot: In the weather, by `carried_options` if the frame shows a style.
+        novel: What was rendered.
+        lying: What lies on the ground in the frame's style; see `lying_in`.
+        options: As they were asked for, not `carried_options`.
+    """
+    top, left, height, width = shot.window
+    seen = novel.seen[top : top + height, left : left + width]
+    label, invalid = shot.label, shot.invalid | ~seen
+    limits = snow_limits(lying, options)
+    if limits is not None and label is not None:
+        buried = buried_borders(novel.frame, shot.window, limits)
+        label = kept_labels(label, buried, options.labels)
+        invalid |= buried | covered_faces(novel.frame, shot.window, limits)
+    return replace(shot, label=label, invalid=invalid)
+
+
+def warm_up() -> None:
+    """Compile or load what draws Gaussians now, before worker processes are started."""
+    point = Gaussians(
+        np.array([[0.0, 0.0, 5.0]], np.float32),
+        np.array([[1.0, 0.0, 0.0, 0.0]], np.float32),
+        np.zeros((1, 3), np.float32),
+        np.zeros(1, np.float32),
+        np.zeros((1, 1, 3), np.float32),
+        np.ones((1, 1), np.float16),
+    )
+    none = Gaussians(*(getattr(point, field.name)[:0] for field in fields(Gaussians)))
+    sky = Sky(np.zeros((6, 2, 2, 3), np.float32), np.ones((6, 2, 2), np.bool_))
+    camera = Camera(np.array([[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]), np.eye(4), 16, 16)
+    owners, offsets = np.zeros(0, np.int32), np.zeros((0, 0, 3), np.float32)
+    support = np.ones(1, np.float32)
+    one = Reconstruction(point, sky, (), none, owners, offsets, {}, {}, {}, support)
+    view(one, camera, 0.0)

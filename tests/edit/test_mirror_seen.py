@@ -3,11 +3,12 @@
 import cv2
 import numpy as np
 import pytest
-from mirror_scene import SKY_LIGHT, Scene
+from mirror_scene import BOXES, SKY_LIGHT, Scene
 
 from weather_aug.edit.physical import mirror_seen, relight
 from weather_aug.edit.physical.layers import layers_of
 from weather_aug.edit.physical.mirror import mirror_map, mirrored
+from weather_aug.edit.physical.mirror_lines import ray_at
 from weather_aug.edit.physical.mirror_seen import road_of, small_camera, with_seen
 from weather_aug.errors import ArgumentError
 from weather_aug.taxonomy import ROAD
@@ -45,44 +46,62 @@ def test_the_road_mirrors_what_is_outside_the_picture_too(pitch_deg, roll_deg):
     assert share_right(scene, scene.seen_in_the_road()) > 0.99
 
 
-@pytest.mark.parametrize("pitch_deg", [-12, -15])
-def test_a_house_that_the_picture_cuts_ends_where_it_ends(pitch_deg):
-    house = ("building", (8.0, 30.0), (-30.0, -3.0), (0.0, 4.0), (0.2, 0.3, 0.1))
-    scene = Scene(pitch_deg, boxes=(house,))
-    assert share_right(scene, scene.seen_in_the_road()) > 0.99
-    assert share_right(scene, None) < 0.95
+HOUSE = ("building", (8.0, 30.0), (-30.0, -3.0), (0.0, 4.0), (0.2, 0.3, 0.1))
+CUT = Scene(-14, 5, boxes=(HOUSE,))
+"""The picture's upper border cuts a house that the road mirrors up to its roof, and the sky."""
+
+
+def test_a_house_that_the_picture_cuts_ends_where_it_ends():
+    assert share_right(CUT, CUT.seen_in_the_road()) > 0.99
+    assert share_right(CUT, None) < 0.9
 
 
 @pytest.mark.parametrize(
     "fault",
     [
         lambda seen: seen._replace(srgb=seen.srgb[::-1].copy(), opacity=seen.opacity[::-1].copy()),
-        lambda seen: seen._replace(opacity=np.zeros_like(seen.opacity)),
-        lambda seen: seen._replace(srgb=seen.srgb[:, ::-1].copy()),
+        lambda seen: seen._replace(opacity=np.ones_like(seen.opacity)),
+        lambda seen: seen._replace(srgb=seen.srgb[:, ::-1].copy(), opacity=seen.opacity[:, ::-1]),
     ],
-    ids=["not turned over", "nothing seen", "left for right"],
+    ids=["not turned over", "no sky", "left for right"],
 )
 def test_a_wrong_render_is_found(fault):
-    scene = Scene(2)
-    assert share_right(scene, fault(scene.seen_in_the_road())) < 0.9
+    assert share_right(CUT, fault(CUT.seen_in_the_road())) < 0.95
 
 
-def test_lines_are_sampled_where_they_lean():
-    """Planted fault: columns for lines."""
-    scene = Scene(0, 9)
-    seen = scene.seen_in_the_road()
-    right = share_right(scene, seen)
-    upright = mirror_seen._rays_on_lines
+def test_lines_lean_as_the_kernels_lines_do():
+    """And where they lean they are no columns."""
+    view = mirror_map(CUT.site()).view
+    rays, climb = mirror_seen._rays_on_lines(view, (180, 320))
+    columns = (np.arange(320) - view.cx) / view.fx
+    for row, line in ((10, 300), (90, 0), (170, 20), (179, 319)):
+        x, y, up = ray_at(np.float32(row), np.float32(line), view)
+        np.testing.assert_allclose([x, y, up], [*rays[row, line], climb[row, line]], atol=1e-5)
+    assert np.abs(rays[170, :, 0] - columns).max() > 0.02
 
-    def on_columns(view, shape):
-        rays, climb = upright(view, shape)
-        columns = np.arange(shape[1], dtype=np.float32)
-        rays[..., 0] = (columns - view.cx) / view.fx
-        return rays, climb
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mirror_seen, "_rays_on_lines", on_columns)
-        assert share_right(scene, seen) < right - 0.05
+def test_the_picture_is_not_overruled_by_what_is_gone():
+    """A car of another moment in the render, where the picture shows an open road."""
+    here, then = Scene(boxes=BOXES[2:]), Scene(boxes=BOXES)
+    assert share_right(here, then.seen_in_the_road()) > 0.97
+
+
+def test_what_is_gone_is_found_by_looking_through_it(monkeypatch):
+    """Planted fault: the picture is not asked."""
+    here, then = Scene(boxes=BOXES[2:]), Scene(boxes=BOXES)
+    monkeypatch.setattr(mirror_seen, "_seen_through", lambda site, *_: np.zeros(site.shape, bool))
+    assert share_right(here, then.seen_in_the_road()) < 0.9
+
+
+def test_what_is_before_the_picture_hides_what_the_picture_shows(monkeypatch):
+    """A roof over the road, above the picture, is mirrored before the house behind it."""
+    roof = ("building", (10.0, 13.0), (-4.0, 4.0), (3.5, 3.6), (0.6, 0.1, 0.1))
+    house = ("building", (30.0, 40.0), (-30.0, 30.0), (0.0, 30.0), (0.2, 0.3, 0.1))
+    scene = Scene(-12, boxes=(roof, house))
+    assert not (scene.frame().image[..., 0] > 150).any()
+    assert share_right(scene, scene.seen_in_the_road()) > 0.97
+    monkeypatch.setattr(mirror_seen, "NEARER", 1e-9)
+    assert share_right(scene, scene.seen_in_the_road()) < 0.9
 
 
 def test_the_way_before_the_road_is_a_share_of_all():
@@ -97,18 +116,15 @@ def test_the_way_before_the_road_is_a_share_of_all():
 
 
 def test_what_was_never_reconstructed_stays_as_the_picture_tells():
-    """A wall of which the render knows nothing is no hole to the sky; open sky stays open."""
-    wall = ("building", (20.0, 30.0), (-60.0, 4.0), (0.0, 4.0), (0.2, 0.3, 0.1))
-    scene = Scene(boxes=(wall,))
-    site, guessed = scene.site(), mirror_map(scene.site())
-    empty = scene.seen_in_the_road()._replace(opacity=np.zeros(site.shape, np.float32))
-    found, light = with_seen(site, NO_SUN, guessed, site.light, empty)
-    kept = found.source >= 0
-    assert kept[site.is_ground].mean() > 0.1
-    assert (guessed.source[kept] >= 0).all()
-    np.testing.assert_array_equal(
-        light[kept], site.light.reshape(-1, 3)[guessed.source[kept]]
-    )
+    """A render that knows nothing changes nothing, but that nothing goes on beyond the picture."""
+    for scene in (Scene(), Scene(3, -6)):
+        site, guessed = scene.site(), mirror_map(scene.site())
+        seen = scene.seen_in_the_road()
+        empty = seen._replace(opacity=np.zeros(site.shape, np.float32))
+        found, light = with_seen(site, NO_SUN, guessed, site.light, empty)
+        assert ((found.source >= 0) == (guessed.source >= 0))[site.is_ground].mean() > 0.95
+        kept = found.source >= 0
+        np.testing.assert_array_equal(light[kept], site.light.reshape(-1, 3)[guessed.source[kept]])
 
 
 def test_the_small_camera_is_the_pictures_own():
@@ -134,14 +150,11 @@ def test_the_road_is_where_the_site_says():
 
 def test_layers_take_the_render():
     """The layers of the mirror, and no others."""
-    scene = Scene(4)
-    site = scene.site()
-    alone, with_render = layers_of(site), layers_of(site, None, scene.seen_in_the_road())
+    site = CUT.site()
+    alone, with_render = layers_of(site), layers_of(site, None, CUT.seen_in_the_road())
     np.testing.assert_array_equal(alone.maps[:12], with_render.maps[:12])
     assert (alone.maps[12:] != with_render.maps[12:]).any()
-    nothing = scene.seen_in_the_road()._replace(srgb=np.zeros((180, 320, 3), np.float32))
-    dark = layers_of(site, None, nothing)
-    assert dark.maps[12:15].mean() < 0.8 * with_render.maps[12:15].mean()
+    assert with_render.maps[15].mean() > 1.1 * alone.maps[15].mean()
 
 
 def test_another_grid_is_refused():

@@ -17,17 +17,21 @@ from weather_aug.clip.types import Camera
 from weather_aug.colour import LUMINANCE, linear_from_srgb
 from weather_aug.edit.physical import relight
 from weather_aug.edit.physical.mirror import MirrorMap
-from weather_aug.edit.physical.mirror_lines import View
+from weather_aug.edit.physical.mirror_lines import FARTHEST_M, View
 from weather_aug.edit.physical.site import Site
 from weather_aug.errors import ArgumentError
-from weather_aug.taxonomy import SKY
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 LEAST_OPACITY = 0.5
 """Of a render's cell that shows a surface."""
-"""The picture's own light is taken where both see a surface in one depth up to this share."""
+NEARER = 0.85
+"""A render's surface hides one that the picture shows if it is nearer than this share of it."""
+THROUGH = 1.1
+"""The picture sees through a place if what it shows there is farther by this factor."""
+OWN_ROWS = 2.0
+"""A cell is its surface's own mirror image up to so many rows from where that must be."""
 
 
 class Seen(NamedTuple):
@@ -66,10 +70,14 @@ def road_of(site: Site) -> tuple[Float64, Float64]:
 def with_seen(
     site: Site, flat: relight.Flattening, guessed: MirrorMap, light: Float32, seen: Seen
 ) -> tuple[MirrorMap, Float32]:
-    """The mirror's map and the light it points to, from a render where that shows a surface.
+    """The mirror's map and the light it points to: of the picture, a render, and guesses.
 
-    Where the render shows none, the road mirrors the sky, unless the picture shows a surface in the
-    very direction of the mirrored ray: what was never reconstructed stays as it was guessed.
+    Where the picture itself shows what the road mirrors, it is sharper than any render, and knows
+    of things that moved while nobody tracked them; a render's surface takes its place only where it
+    lies before it. Where the picture does not show it, the render does. A render's surface that the
+    picture sees through was not there at this moment, and where the render is open it may not know
+    all: what is guessed there stays, unless the mirrored ray leaves the picture. There nothing is
+    known but the render, and no surface is the sky.
 
     Args:
         site: The frame.
@@ -93,49 +101,97 @@ def with_seen(
     view = guessed.view
     rays, climb = _rays_on_lines(view, shape)
     columns = np.clip(np.round(rays[..., 0] * view.fx + view.cx), 0, shape[1] - 1).astype(np.intp)
-    rows = np.arange(shape[0])[:, None]
-    shown = (seen.opacity[rows, columns] >= LEAST_OPACITY) & (climb < 0)
-    own = relit(site, flat, view, seen)[rows, columns]
-    behind = (guessed.source >= 0) & _surface_ahead(site, view, rays, climb)
-    picture = light.reshape(-1, 3)[np.maximum(guessed.source, 0)]
-    cells = np.arange(shape[0] * shape[1], dtype=np.int32).reshape(shape)
-    source = np.where(shown | behind, cells, np.int32(-1))
+    on_lines = np.arange(shape[0])[:, None], columns
+    place = places(view, seen.depth_m)
+    opaque = (seen.opacity >= LEAST_OPACITY) & (seen.depth_m > 0)
+    gone = (opaque & _seen_through(site, view, place))[on_lines]
+    opaque = opaque[on_lines] & (climb < 0)
+    shown_depth_m = _shown_depth_m(site, guessed, rays, climb)
+    nearer = seen.depth_m[on_lines] < NEARER * shown_depth_m
+    own = opaque & ~gone & nearer
+    kept = np.isfinite(shown_depth_m) | gone | opaque | _goes_into(view, shape, rays, climb)
+    kept &= ~own & (guessed.source >= 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        way = 1.0 + view.above_m / (climb * seen.depth_m[rows, columns])
+        way = np.clip(1.0 + view.above_m / (climb * seen.depth_m[on_lines]), 0.0, 1.0)
     # Where the render and the picture are silent is the sky, infinitely far.
-    spread = np.where(shown, np.clip(way, 0.0, 1.0), np.where(behind, guessed.spread, 1.0))
-    spread = spread.astype(np.float32)
+    spread = np.where(own, way, np.where(kept, guessed.spread, 1.0)).astype(np.float32)
+    cells = np.arange(shape[0] * shape[1], dtype=np.int32).reshape(shape)
+    source = np.where(own | kept, cells, np.int32(-1))
     source.flags.writeable = spread.flags.writeable = False
-    mixed = np.where(shown[..., None], own, picture).astype(np.float32)
+    picture = light.reshape(-1, 3)[np.maximum(guessed.source, 0)]
+    rendered = relit(view, flat, place, seen.srgb)[on_lines]
+    mixed = np.where(own[..., None], rendered, picture).astype(np.float32)
     return MirrorMap(source, spread, view), mixed
 
 
-def relit(site: Site, flat: relight.Flattening, view: View, seen: Seen) -> Float32:
-    """Linear light (h, w, 3) of a render's surfaces without the sun's, on the small grid.
+def places(view: View, depth_m: Float32) -> Float32:
+    """Camera coordinates (h, w, 3), metres, of what mirror images at depths (h, w) are images of.
 
-    Each surface takes the relighting of its own place in the picture, or of the picture's border
-    nearest to it.
+    Source: reflection in a plane, x - 2 h n, of a point at height h over it.
     """
-    height, width = site.shape
+    height, width = depth_m.shape
     rows, columns = np.mgrid[:height, :width].astype(np.float32)
-    x, y = (columns - view.cx) / view.fx, (rows - view.cy) / view.fy
+    rays = np.stack(
+        [(columns - view.cx) / view.fx, (rows - view.cy) / view.fy, np.ones_like(rows)], axis=-1
+    )
     normal = np.array([view.nx, view.ny, view.nz])
-    image = np.where(np.isfinite(seen.depth_m), seen.depth_m, 0.0)[..., None] * np.stack(
-        [x, y, np.ones_like(x)], axis=-1
-    )
+    image = np.where(np.isfinite(depth_m), depth_m, np.float32(0.0))[..., None] * rays
     over = view.above_m + image @ normal
-    place = image - 2.0 * over[..., None] * normal
-    z = np.maximum(place[..., 2], 1e-3)
+    return np.asarray(image - np.float32(2.0) * over[..., None] * normal, np.float32)
+
+
+def relit(view: View, flat: relight.Flattening, place: Float32, srgb: Float32) -> Float32:
+    """Linear light (h, w, 3) of surfaces at places (h, w, 3) without the sun's.
+
+    Each takes the relighting of its own place in the picture, or of the picture's border nearest to
+    it.
+    """
+    column, row = _pixels(view, place)
     gains = cv2.remap(
-        np.ascontiguousarray(flat.objects),
-        (place[..., 0] / z * view.fx + view.cx).astype(np.float32),
-        (place[..., 1] / z * view.fy + view.cy).astype(np.float32),
-        cv2.INTER_LINEAR,
+        np.ascontiguousarray(flat.objects), column, row, cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
-    )
-    luma = seen.srgb @ LUMINANCE.astype(np.float32)
+    )  # fmt: skip
+    luma = srgb @ LUMINANCE.astype(np.float32)
     gain = np.clip(gains[..., 0] * luma + gains[..., 1], relight.LEAST_GAIN, relight.MOST_GAIN)
-    return (linear_from_srgb(seen.srgb) * np.exp(gain)[..., None]).astype(np.float32)
+    return (linear_from_srgb(srgb) * np.exp(gain)[..., None]).astype(np.float32)
+
+
+def _pixels(view: View, place: Float32) -> tuple[Float32, Float32]:
+    """Columns and rows (h, w) at which the camera sees places; behind it, somewhere far off."""
+    z = np.maximum(place[..., 2], np.float32(1e-3))
+    return place[..., 0] / z * view.fx + view.cx, place[..., 1] / z * view.fy + view.cy
+
+
+def _seen_through(site: Site, view: View, place: Float32) -> NDArray[np.bool_]:
+    """Where (h, w) the picture looks at a place and sees what is far behind it."""
+    column, row = (np.round(k) for k in _pixels(view, place))
+    inside = _inside(site.shape, place, column, row)
+    row, column = (np.where(inside, k, 0).astype(np.intp) for k in (row, column))
+    # The farthest of the neighbours would call every edge an opening; the nearest forgives a cell.
+    nearest = cv2.erode(site.depth_m, np.ones((3, 3), np.uint8))
+    return inside & (nearest[row, column] > THROUGH * place[..., 2])
+
+
+def _shown_depth_m(site: Site, guessed: MirrorMap, rays: Float32, climb: Float32) -> Float32:
+    """(h, w) depth of the mirror image where the picture shows what is mirrored, else infinite.
+
+    What was guessed about a surface goes on where its own mirror image is not.
+    """
+    width = site.shape[1]
+    view = guessed.view
+    cell = np.maximum(guessed.source, 0)
+    # On its line a mirrored cell has the line's ray in its own row.
+    row, line = cell // width, np.arange(width)[None, :].repeat(site.shape[0], axis=0)
+    z = site.depth_m.reshape(-1)[cell]
+    z = np.where(np.isfinite(z), z, np.float32(FARTHEST_M))
+    over = view.above_m + z * climb[row, line]
+    depth = z - np.float32(2.0) * over * view.nz
+    down = z * rays[row, line, 1] - np.float32(2.0) * over * view.ny
+    with np.errstate(divide="ignore", invalid="ignore"):
+        image_row = view.fy * down / depth + view.cy
+    rows = np.arange(site.shape[0])[:, None]
+    is_shown = (guessed.source >= 0) & (depth > 0) & (np.abs(image_row - rows) <= OWN_ROWS)
+    return np.where(is_shown, depth, np.float32(np.inf)).astype(np.float32)
 
 
 def _rays_on_lines(view: View, shape: tuple[int, int]) -> tuple[Float32, Float32]:
@@ -148,13 +204,19 @@ def _rays_on_lines(view: View, shape: tuple[int, int]) -> tuple[Float32, Float32
     return np.stack([x, y], axis=-1), view.nx * x + view.ny * y + view.nz
 
 
-def _surface_ahead(site: Site, view: View, rays: Float32, climb: Float32) -> NDArray[np.bool_]:
-    """Where (h, w) the mirrored ray's direction is in the picture, and no sky there."""
-    height, width = site.shape
-    z = 1.0 - 2.0 * climb * view.nz
-    x = (rays[..., 0] - 2.0 * climb * view.nx) / z
-    y = (rays[..., 1] - 2.0 * climb * view.ny) / z
-    column, row = np.round(x * view.fx + view.cx), np.round(y * view.fy + view.cy)
-    inside = (z > 0) & (row >= 0) & (row < height) & (column >= 0) & (column < width)
-    row, column = (np.where(inside, k, 0).astype(np.intp) for k in (row, column))
-    return inside & (site.small_classes[row, column] != SKY)
+def _goes_into(
+    view: View, shape: tuple[int, int], rays: Float32, climb: Float32
+) -> NDArray[np.bool_]:
+    """Where (h, w) the mirrored ray's direction is one that the picture shows."""
+    turned = np.concatenate([rays, np.ones_like(rays[..., :1])], axis=-1)
+    normal = np.array([view.nx, view.ny, view.nz])
+    turned = turned - np.float32(2.0) * climb[..., None] * normal
+    column, row = (np.round(k) for k in _pixels(view, turned))
+    return _inside(shape, turned, column, row)
+
+
+def _inside(
+    shape: tuple[int, int], place: Float32, column: Float32, row: Float32
+) -> NDArray[np.bool_]:
+    inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
+    return inside & (place[..., 2] > 0)

@@ -10,14 +10,25 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor, nn
 
 from weather_aug._checks import finite
 from weather_aug.clip.types import Box, Frame
-from weather_aug.gaussians.rotations import slerped
+from weather_aug.gaussians.placing import placed as placed
+from weather_aug.gaussians.rotations import (
+    matrices_of,
+    product,
+    quaternions_of,
+    quaternions_of_vectors,
+    slerped,
+    slerped_tensor,
+)
 from weather_aug.gaussians.types import Actor
 
 Float32 = NDArray[np.float32]
@@ -27,6 +38,12 @@ MOVING_M, DEFORMABLE_MOVING_M = 1.0, 0.5
 """What goes farther from where it was first is an actor (OmniRe); the rest is background."""
 TIME_TOLERANCE_S = 1e-6
 OFFSET_TERMS = 4
+ROTATION_LEARNING_RATE, TRANSLATION_LEARNING_RATE = 1e-5, 5e-4
+"""Of the refined poses, for Adam (OmniRe)."""
+SMOOTHNESS_WEIGHT, SMOOTHNESS_MOMENTS = 0.01, 5
+"""Of `ActorPoses.smoothness` in the loss, and how many moments it looks at together (OmniRe)."""
+OFFSETS_WEIGHT = 0.01
+"""Of `offsets_penalty` in the loss: 10 cm cost as much as an L1 difference of 1e-4."""
 _DEFORMABLE = frozenset(
     "adult animal animals bicycle bicycles bicyclist bike bird cat child cyclist dog human "
     "motorcycle motorcyclist motorbike pedestrian people person rider scooter skater stroller "
@@ -191,3 +208,138 @@ def _travel_m(actor: Actor) -> float:
 
 def _threshold_m(actor: Actor, moving_m: float) -> float:
     return moving_m * (DEFORMABLE_MOVING_M / MOVING_M if actor.is_deformable else 1.0)
+
+
+class ActorPoses(nn.Module):
+    """Poses of actors, refined at each tracked moment.
+
+    The heading of a moment turns by a rotation vector in the actor's own axes, its place moves by a
+    translation in world axes; both start at zero, which gives the recorded poses bit for bit in
+    `refined`. Between moments as `pose_at`.
+
+    Args:
+        actors: As recorded.
+        origin_m: (3,) place in the world that `poses` takes for 0, so that float32 keeps
+            millimetres far from the world's origin.
+    """
+
+    _rotations: Tensor
+    _places_m: Tensor
+    _steps: Tensor
+    _moments: Tensor
+    _residual: Tensor
+
+    def __init__(
+        self, actors: Sequence[Actor], origin_m: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> None:
+        super().__init__()
+        self.actors = tuple(actors)
+        counts = [len(actor.times_s) for actor in self.actors]
+        self._starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        recorded = np.concatenate([np.zeros((0, 4, 4)), *(a.world_from_actor for a in self.actors)])
+        steps = [_turns(actor.world_from_actor[:, :3, :3]) for actor in self.actors]
+        windows = [
+            _windows(actor.times_s, start)
+            for actor, start in zip(self.actors, self._starts, strict=False)
+        ]
+        tables = {
+            "_rotations": recorded[:, :3, :3],
+            "_places_m": recorded[:, :3, 3] - np.asarray(origin_m, np.float64),
+            "_steps": np.concatenate([np.zeros((0, 4)), *steps]),
+            "_moments": np.concatenate(
+                [np.zeros((0, SMOOTHNESS_MOMENTS), np.int64), *(m for m, _ in windows)]
+            ),
+            "_residual": np.concatenate(
+                [np.zeros((0, SMOOTHNESS_MOMENTS)), *(w for _, w in windows)]
+            ),
+        }
+        for name, table in tables.items():
+            self.register_buffer(name, torch.from_numpy(table.copy()), persistent=False)
+        self.rotations_rad = nn.Parameter(torch.zeros(len(recorded), 3))
+        """Of all moments of all actors, one after the other."""
+        self.translations_m = nn.Parameter(torch.zeros(len(recorded), 3))
+
+    def poses(self, time_s: float) -> tuple[Tensor, Tensor]:
+        """(A, 4, 4) float32 world_from_actor and (A,) bool whether it is there at that moment.
+
+        The pose of who is not there is that of its first moment and gets a gradient; leave its
+        Gaussians away.
+        """
+        places = [_place_in(actor.times_s, time_s) for actor in self.actors]
+        device = self.rotations_rad.device
+        present = torch.tensor([place is not None for place in places], dtype=torch.bool)
+        firsts = torch.tensor([place[0] if place else 0 for place in places], dtype=torch.int64)
+        share = torch.tensor([place[1] if place else 0.0 for place in places], dtype=torch.float64)
+        before = (firsts + torch.from_numpy(self._starts[:-1])).to(device)
+        share = share.to(device)
+        after = before + (share > 0)
+        deltas = quaternions_of_vectors(self.rotations_rad.double())
+        end = product(self._steps[before], deltas[after])
+        turn = slerped_tensor(deltas[before], end, share)
+        rotations = self._rotations[before] @ matrices_of(turn)
+        refined_m = self._places_m + self.translations_m.double()
+        middle_m = torch.lerp(refined_m[before], refined_m[after], share[:, None])
+        return _rigid(rotations, middle_m).float(), present.to(device)
+
+    def smoothness(self) -> Tensor:
+        """Mean distance, metres, of places from the straight line through those around them.
+
+        Each place is held against a line fitted to the two before and the two after; who moves
+        evenly pays nothing, however uneven the moments. Tracks of fewer than 5 moments pay nothing.
+        """
+        if len(self._moments) == 0:
+            return self.translations_m.sum() * 0.0
+        refined_m = self._places_m + self.translations_m.double()
+        residual_m = (self._residual[..., None] * refined_m[self._moments]).sum(dim=1)
+        return residual_m.abs().sum(dim=-1).mean().float()
+
+    def refined(self) -> tuple[Actor, ...]:
+        """The actors with their refined poses."""
+        with torch.no_grad():
+            turns = matrices_of(quaternions_of_vectors(self.rotations_rad.double())).cpu().numpy()
+            moves_m = self.translations_m.double().cpu().numpy()
+        actors = []
+        for actor, start, end in zip(self.actors, self._starts, self._starts[1:], strict=False):
+            poses = actor.world_from_actor.copy()
+            poses[:, :3, :3] = poses[:, :3, :3] @ turns[start:end]
+            poses[:, :3, 3] += moves_m[start:end]
+            actors.append(replace(actor, world_from_actor=poses))
+        return tuple(actors)
+
+
+def _turns(rotations: Float64) -> Float64:
+    """(T, 4) quaternion from each moment to the next; the last has none and keeps 1."""
+    steps = np.tile([1.0, 0.0, 0.0, 0.0], (len(rotations), 1))
+    steps[:-1] = quaternions_of(np.swapaxes(rotations[:-1], -1, -2) @ rotations[1:])
+    return steps
+
+
+def _windows(times_s: Float64, start: int) -> tuple[NDArray[np.int64], Float64]:
+    """(W, 5) rows of the table, and the weights by which they give a place's distance from a line.
+
+    The line is the least-squares fit through the moments around the middle one, at its time.
+    """
+    count, half = len(times_s), SMOOTHNESS_MOMENTS // 2
+    moments = np.arange(half, count - half)[:, None] + np.arange(-half, half + 1)
+    off_s = times_s[moments] - times_s[moments[:, half : half + 1]]
+    others = np.delete(off_s, half, axis=1)
+    mean = others.mean(axis=1, keepdims=True)
+    spread = ((others - mean) ** 2).sum(axis=1, keepdims=True)
+    line = 1 / others.shape[1] - mean * (others - mean) / spread
+    return moments + start, np.insert(-line, half, 1.0, axis=1)
+
+
+def _rigid(rotations: Tensor, places_m: Tensor) -> Tensor:
+    """(A, 4, 4) of rotations (A, 3, 3) and places (A, 3)."""
+    last = rotations.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(rotations), 1, 4)
+    return torch.cat([torch.cat([rotations, places_m[:, :, None]], dim=2), last], dim=1)
+
+
+def offsets_penalty(offsets_m: Tensor) -> Tensor:
+    """Mean square of the offsets (M, B, 3) over the Gaussians and over their tracks, m².
+
+    Half the sum of the squared coefficients, because the basis is orthogonal over the track. That
+    neighbours should move alike is left out: it needs the neighbours of each Gaussian anew after
+    each change of their number, and costs more than the offsets themselves.
+    """
+    return 0.5 * offsets_m.square().sum(dim=(1, 2)).mean()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -13,11 +13,11 @@ from torch import Tensor
 
 from weather_aug.clip.types import Camera, FrameKey
 from weather_aug.errors import ArgumentError, printable
-from weather_aug.gaussians.gather import Gathered, Weights, gather, sky_of
-from weather_aug.gaussians.rasterise import NEAR_M, Drawn, rasterise
+from weather_aug.gaussians.gather import Gathered, Weights, gather, rasterised, sky_of
+from weather_aug.gaussians.rasterise import NEAR_M, Drawn
 from weather_aug.gaussians.rotations import matrices_of
-from weather_aug.gaussians.sky import sky_colours, sky_seen
-from weather_aug.gaussians.types import Float32, Pinhole, Reconstruction
+from weather_aug.gaussians.sky import sky_picture
+from weather_aug.gaussians.types import Float32, Pinhole, Reconstruction, Sky
 from weather_aug.taxonomy import IGNORE, SKY
 
 FIELDS = ("image", "depth", "label", "seen", "normals")
@@ -41,7 +41,8 @@ class View(NamedTuple):
     depth_m: Float32 | None
     """(H, W) z-depth, `inf` where sky is."""
     label: NDArray[np.uint8] | None
-    """(H, W) train ids, 255 where no class is clear; None as well if nothing is labelled."""
+    """(H, W) train ids, 255 where no class is clear or the sky was never seen; None as well if the
+    reconstruction has no class scores."""
     seen: NDArray[np.bool_] | None
     """(H, W): recorded frames showed what is here; None as well without `support`."""
     normals_world: Float32 | None
@@ -97,23 +98,21 @@ def view(
         drawn, parts = _drawn(gathered, camera, planes, threads)
     opacity = drawn.opacity.numpy()
     through = 1 - opacity
-    # Elsewhere the sky would not change a byte.
-    open_sky = through > 1 / 512
-    rays = _rays(camera, open_sky)
     image = depth_m = label = seen = normals = None
     if "image" in wanted:
-        image = parts["image"]
         sky = sky_of(reconstruction, style, amount)
-        image[open_sky] += through[open_sky, None] * sky_colours(sky, rays)
-        image = _bytes(image, exposure)
+        behind = _behind(sky.faces, camera, through)
+        image = _bytes(parts["image"] + through[..., None] * behind, exposure)
     if "depth" in wanted:
         depth_m = np.where(opacity >= SURFACE_OPACITY, drawn.depth_m.numpy(), np.float32(np.inf))
+    if parts.keys() & {"label", "seen"}:
+        # Sky that no frame showed is no known class.
+        was_seen = np.repeat(reconstruction.sky.seen[..., None], 3, axis=3)
+        known_sky = through * _behind(was_seen, camera, through)[..., 0]
     if "label" in parts:
-        label = _label(parts["label"], _claimed(gathered.class_scores), through)
+        label = _label(parts["label"], _claimed(gathered.class_scores), known_sky)
     if "seen" in parts:
-        share = parts["seen"][..., 0]
-        share[open_sky] += through[open_sky] * sky_seen(reconstruction.sky, rays)
-        seen = share >= 0.5
+        seen = parts["seen"][..., 0] + known_sky >= 0.5
     if "normals" in wanted:
         normals = _unit(parts["normals"], opacity)
     return View(opacity, image, depth_m, label, seen, normals)
@@ -220,35 +219,21 @@ def _drawn(
     """One pass over all planes, and the picture of each field, (H, W, C)."""
     # Depth and opacity come with any channel.
     stacked = torch.cat([*planes.values()], dim=1) if planes else gathered.opacities[:, None]
-    camera_from_origin = np.eye(4, dtype=np.float32)
-    camera_from_origin[:3, :3] = camera.world_from_camera[:3, :3].T
-    drawn = rasterise(
-        gathered.means_m,
-        gathered.quaternions,
-        gathered.scales_m,
-        gathered.opacities,
-        stacked,
-        torch.from_numpy(camera_from_origin),
-        Pinhole.of(camera),
-        threads=threads,
-    )
+    drawn = rasterised(gathered, camera, stacked, threads)
     sizes = [plane.shape[1] for plane in planes.values()]
     parts = torch.split(drawn.colours, sizes, dim=2) if planes else ()
     return drawn, {name: part.numpy() for name, part in zip(planes, parts, strict=True)}
 
 
-def _rays(camera: Camera, chosen: NDArray[np.bool_]) -> Float32:
-    """(P, 3) unit directions in world axes of the chosen pixels, row by row."""
-    rows, columns = np.nonzero(chosen)
-    (fx, fy), (cx, cy) = camera.focal_px, camera.principal_px
-    local = np.stack([(columns - cx) / fx, (rows - cy) / fy, np.ones(len(rows))], axis=1)
-    rays = local @ camera.world_from_camera[:3, :3].T
-    return (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
+def _behind(faces: NDArray[Any], camera: Camera, through: Float32) -> Float32:
+    """(H, W, 3) of a cube map behind a picture; 0 where not half a level would come through."""
+    sky = Sky(faces, np.ones(faces.shape[:3], bool))
+    return sky_picture(sky, Pinhole.of(camera), camera.world_from_camera, through > 1 / 512)
 
 
-def _label(shares: Float32, ids: NDArray[np.intp], through: Float32) -> NDArray[np.uint8]:
-    """Classes that claim most of their pixels; the light from behind claims for the sky."""
-    shares[..., np.searchsorted(ids, SKY)] += through
+def _label(shares: Float32, ids: NDArray[np.intp], sky: Float32) -> NDArray[np.uint8]:
+    """Classes that claim most of their pixels; the light of the sky claims for the sky."""
+    shares[..., np.searchsorted(ids, SKY)] += sky
     best, place = torch.from_numpy(shares).max(dim=2)
     label = ids.astype(np.uint8)[place.numpy()]
     label[best.numpy() < CLEAR_SCORE] = IGNORE

@@ -11,25 +11,17 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from weather_aug._checks import finite
+from weather_aug.clip.types import Camera, Frame
 from weather_aug.errors import ArgumentError, printable
-from weather_aug.gaussians.actors import offset_basis, pose_at
+from weather_aug.gaussians.actors import offset_bases, pose_at
 from weather_aug.gaussians.harmonics import colours_seen
-from weather_aug.gaussians.rotations import quaternions_of
-from weather_aug.gaussians.types import Float32, Reconstruction, Sky, Style
+from weather_aug.gaussians.placing import placed
+from weather_aug.gaussians.rasterise import Drawn, rasterise
+from weather_aug.gaussians.types import Float32, Pinhole, Reconstruction, Sky, Style
 
 Float64 = NDArray[np.float64]
 Weights = Mapping[str, float]
 RIGID_TOLERANCE = 1e-4
-
-
-class Placed(NamedTuple):
-    """Where the Gaussians of one actor stand among the gathered ones."""
-
-    track_id: int
-    rows: slice
-    """Of the gathered tensors."""
-    world_from_actor: Float64
-    """(4, 4), metres."""
 
 
 class Gathered(NamedTuple):
@@ -49,7 +41,8 @@ class Gathered(NamedTuple):
     """(R, C); C = 0 if unlabelled or not asked for."""
     rows: Tensor
     """(R,) int64: place of each among the background's Gaussians followed by all actors'."""
-    actors: tuple[Placed, ...]
+    turns: Tensor
+    """(A, 3, 3) world_from_actor of the last A rows, which are the actors'."""
     origin_m: Float64
     """(3,) of the tensors, in the world."""
 
@@ -65,11 +58,10 @@ class Gathered(NamedTuple):
         """
         sh = self.sh if sh is None else sh
         towards = self.means_m - _tensor(np.asarray(centre_m, np.float64) - self.origin_m)
-        if self.actors:
-            towards = towards.clone()
-            for placed in self.actors:
-                # Row vectors: multiplying by world_from_actor turns them into the actor's axes.
-                towards[placed.rows] @= _tensor(placed.world_from_actor[:3, :3])
+        first = len(towards) - len(self.turns)
+        # A row vector times world_from_actor is in the actor's axes.
+        local = torch.bmm(towards[first:, None], self.turns)[:, 0]
+        towards = torch.cat([towards[:first], local])
         return colours_seen(sh, towards, torch.zeros(3), degree)
 
 
@@ -105,45 +97,72 @@ def gather(
     """
     weights = style_weights(reconstruction, style, amount)
     origin = np.asarray(origin_m, np.float64)
-    placed = _placed(reconstruction, time_s, without, poses or {})
     background, shells = reconstruction.background, reconstruction.actor_gaussians
-    members = [np.flatnonzero(reconstruction.owners == index) for index, _ in placed]
-    picked = np.concatenate([*members, np.zeros(0, np.intp)]).astype(np.int64)
-
-    means = [background.means_m - origin]
-    quaternions = [background.quaternions]
-    actors = []
-    start = len(background)
-    for (index, world_from_actor), rows in zip(placed, members, strict=True):
-        actor = reconstruction.actors[index]
-        offsets = reconstruction.offsets_m[rows]
-        local = shells.means_m[rows].astype(np.float64)
-        if actor.is_deformable:
-            basis = offset_basis(actor.times_s, time_s, offsets.shape[1])
-            local = local + np.einsum("mbi,b->mi", offsets, basis)
-        rotation, shift_m = world_from_actor[:3, :3], world_from_actor[:3, 3] - origin
-        means.append(local @ rotation.T + shift_m)
-        quaternions.append(_turned(quaternions_of(rotation), shells.quaternions[rows]))
-        actors.append(Placed(actor.track_id, slice(start, start + len(rows)), world_from_actor))
-        start += len(rows)
+    present = _present(reconstruction, time_s, without, poses or {})
+    matrices = np.array([*present.values()]).reshape(-1, 4, 4)
+    matrices[:, :3, 3] -= origin
+    place = np.full(len(reconstruction.actors), -1)
+    place[list(present)] = np.arange(len(present))
+    picked = np.flatnonzero(place[reconstruction.owners] >= 0)
+    owners = torch.from_numpy(place[reconstruction.owners[picked]])
+    means, quaternions = placed(
+        _tensor(shells.means_m[picked]),
+        _tensor(shells.quaternions[picked]),
+        owners,
+        _tensor(reconstruction.offsets_m[picked]),
+        _tensor(matrices),
+        _tensor(
+            offset_bases(
+                [reconstruction.actors[index] for index in present],
+                time_s,
+                reconstruction.offsets_m.shape[1],
+            )
+        ),
+    )
 
     def both(name: str) -> Tensor:
-        parts = getattr(background, name), getattr(shells, name)[picked]
-        return _joined(parts)
+        return _joined([getattr(background, name), getattr(shells, name)[picked]])
 
     return Gathered(
-        means_m=_joined(means),
-        quaternions=_joined(quaternions),
+        means_m=torch.cat([_tensor(background.means_m - origin), means]),
+        quaternions=torch.cat([_tensor(background.quaternions), quaternions]),
         scales_m=both("log_scales").exp_(),
         opacities=both("logit_opacities").sigmoid_(),
         sh=_blended_sh(reconstruction, weights, picked),
-        class_scores=both("class_scores") if labels else torch.zeros(start, 0),
+        class_scores=both("class_scores")
+        if labels
+        else torch.zeros(len(background) + len(picked), 0),
         rows=torch.from_numpy(
             np.concatenate([np.arange(len(background)), len(background) + picked])
         ),
-        actors=tuple(actors),
+        turns=_tensor(matrices[:, :3, :3])[owners],
         origin_m=origin,
     )
+
+
+def rasterised(gathered: Gathered, camera: Camera, planes: Tensor, threads: int = 1) -> Drawn:
+    """Blend `planes` (R, C) in a camera's picture; gradients flow to them."""
+    rotation = camera.world_from_camera[:3, :3].T
+    camera_from_origin = np.eye(4)
+    camera_from_origin[:3, :3] = rotation
+    camera_from_origin[:3, 3] = rotation @ (gathered.origin_m - camera.centre_world)
+    return rasterise(
+        gathered.means_m,
+        gathered.quaternions,
+        gathered.scales_m,
+        gathered.opacities,
+        planes,
+        _tensor(camera_from_origin),
+        Pinhole.of(camera),
+        threads=threads,
+    )
+
+
+def camera_of(reconstruction: Reconstruction, frame: Frame) -> Camera:
+    """The refined camera of a recorded frame, at the size of its picture."""
+    camera = reconstruction.cameras.get(frame.key, frame.camera)
+    size = (frame.camera.width, frame.camera.height)
+    return camera if (camera.width, camera.height) == size else camera.resized(*size)
 
 
 def sky_of(reconstruction: Reconstruction, style: str | Weights | None, amount: float) -> Sky:
@@ -176,13 +195,13 @@ def style_weights(
     return {name: amount * weight for name, weight in weights.items() if amount * weight > 0}
 
 
-def _placed(
+def _present(
     reconstruction: Reconstruction,
     time_s: float,
     without: Collection[int],
     poses: Mapping[int, ArrayLike],
-) -> list[tuple[int, Float64]]:
-    """Index and pose of each actor that is to be drawn."""
+) -> dict[int, Float64]:
+    """Poses (4, 4) by index of the actors that are to be drawn."""
     known = {actor.track_id for actor in reconstruction.actors}
     for name, tracks in (("without", without), ("poses", poses)):
         unknown = set(tracks) - known
@@ -191,17 +210,15 @@ def _placed(
                 f"{name} names track {sorted(unknown)[0]}, which the reconstruction does not have; "
                 f"its tracks are {sorted(known)}"
             )
-    placed = []
+    present = {}
     for index, actor in enumerate(reconstruction.actors):
         if actor.track_id in without:
             continue
         if actor.track_id in poses:
-            placed.append((index, _rigid(actor.track_id, poses[actor.track_id])))
-        else:
-            pose = pose_at(actor, time_s)
-            if pose is not None:
-                placed.append((index, pose))
-    return placed
+            present[index] = _rigid(actor.track_id, poses[actor.track_id])
+        elif (pose := pose_at(actor, time_s)) is not None:
+            present[index] = pose
+    return present
 
 
 def _rigid(track_id: int, pose: ArrayLike) -> Float64:
@@ -219,15 +236,8 @@ def _rigid(track_id: int, pose: ArrayLike) -> Float64:
     return matrix
 
 
-def _turned(by: Float64, quaternions: Float32) -> Float64:
-    """Products `by` ⊗ q, (M, 4)."""
-    w, x, y, z = by
-    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    return quaternions @ left.T
-
-
 def _blended_sh(
-    reconstruction: Reconstruction, weights: Weights, picked: NDArray[np.int64]
+    reconstruction: Reconstruction, weights: Weights, picked: NDArray[np.intp]
 ) -> Tensor:
     def parts(styles: Mapping[str, Style]) -> dict[str, tuple[Any, Any]]:
         return {name: (style.sh, style.actor_sh[picked]) for name, style in styles.items()}

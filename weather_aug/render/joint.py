@@ -1,7 +1,7 @@
 """Particles sorted among a scene's Gaussians, all blended in one pass, instead of over its picture.
 
 `compose.render` has two layers: the scene's picture with one depth at each pixel, and air and
-particles over it. Where a pixel shows one surface that is exact, and scenes cache it. Where it shows
+particles over it. Where a pixel shows one surface that is exact, and scenes cache it. Where it has
 several (soft edges, leaves, half-transparent Gaussians) one depth stands for all of them. Here each
 Gaussian has its own place in the order and its own way through the air: its light c becomes
 t c + (1 - t) A, and a flake between two Gaussians is drawn between them.
@@ -141,9 +141,7 @@ def render_joint(
     window = (0, 0, camera.height, camera.width)
     under = ambience.under(weather.overcast)
     falling, colours = _particles(
-        splats_of(
-            camera, time_s, fields, resolved, under, optics, medium, carried, window, shelter
-        )
+        splats_of(camera, time_s, fields, resolved, under, optics, medium, carried, window, shelter)
     )
     through = _through(scene, optics, medium, carried)[:, None]
     veil = (1.0 - through) * ambience.airlight.astype(np.float32)

@@ -136,19 +136,20 @@ def mirrored(
         ArgumentError: As of `mirrored_camera`, or if there is no such frame.
     """
     below = mirrored_camera(camera, plane)
+    rotation = below.world_from_camera[:3, :3]
+    camera_from_origin = np.eye(4, dtype=np.float32)
+    camera_from_origin[:3, :3] = rotation.T
+    camera_from_origin[:3, 3] = rotation.T @ (camera.centre_world - below.centre_world)
     with torch.no_grad():
         gathered = gather(reconstruction, time_s, origin_m=camera.centre_world)
         kept = torch.from_numpy(stands_on(gathered, camera, plane))
-        colours = gathered.colours_seen(camera.centre_world)[kept]
-        pose = below.world_from_camera.copy()
-        pose[:3, 3] -= gathered.origin_m
         drawn = rasterise(
             gathered.means_m[kept],
             gathered.quaternions[kept],
             gathered.scales_m[kept],
             gathered.opacities[kept],
-            colours,
-            torch.from_numpy(np.linalg.inv(pose).astype(np.float32)),
+            gathered.colours_seen(camera.centre_world)[kept],
+            torch.from_numpy(camera_from_origin),
             Pinhole.of(below),
             threads=threads,
         )
@@ -285,7 +286,9 @@ def _sampled(
     """Points of ellipsoids, those with equally many along each axis together."""
     half = EXTENT_SIGMAS * np.exp(gaussians.log_scales[picked].astype(np.float64))
     counts = np.clip(np.ceil(2.0 * half / spacing_m), 1, MOST_SAMPLES).astype(np.int64)
-    turned = matrices_of(torch.from_numpy(gaussians.quaternions[picked].astype(np.float64))).numpy()
+    unit = gaussians.quaternions[picked].astype(np.float64)
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    turned = matrices_of(torch.from_numpy(unit)).numpy()
     axes = turned * half[:, None, :]
     for alike in np.unique(counts, axis=0):
         members = np.flatnonzero((counts == alike).all(axis=1))

@@ -133,9 +133,7 @@ def shelter_of(views: Iterable[View], axes_world: Float64) -> Shelter | None:
     return _mapped(cells, cover_m, reference_m, axes_world, labelled)
 
 
-def shelter_of_points(
-    points: Points, axes_world: Float64, reference_m: Float64
-) -> Shelter | None:
+def shelter_of_points(points: Points, axes_world: Float64, reference_m: Float64) -> Shelter | None:
     """Map the covers among a drive's surfaces, by the same rules.
 
     Each point counts as seen in as many frames as are asked for: a surface that only one frame

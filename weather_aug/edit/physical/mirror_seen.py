@@ -24,10 +24,10 @@ from weather_aug.errors import ArgumentError
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-LEAST_OPACITY = 0.5
-"""Of a render's cell that shows a surface."""
-NEARER = 0.85
-"""A render's surface hides one that the picture shows if it is nearer than this share of it."""
+LEAST_OPACITY, SURE_OPACITY = 0.5, 0.9
+"""Of a render's cell that shows some surface, and of one that shows nothing else."""
+BEHIND = 0.9
+"""A render's surface is behind what is guessed if that has less than this share of its depth."""
 THROUGH = 1.1
 """The picture sees through a place if what it shows there is farther by this factor."""
 OWN_ROWS = 2.0
@@ -37,8 +37,8 @@ OWN_ROWS = 2.0
 class Seen(NamedTuple):
     """The street's mirror image in the road's plane, on the small grid (h, w) of a site.
 
-    In the picture's own places, as if the road were glass with the mirrored street below it: without
-    what is below the road, the ground itself, and the sky.
+    In the picture's own places, as if the road were glass with the mirrored street below it; without
+    the ground itself, what is below it, and the sky.
     """
 
     srgb: Float32
@@ -50,7 +50,7 @@ class Seen(NamedTuple):
 
 
 def small_camera(site: Site) -> Camera:
-    """The camera of a site's small grid: one pixel is one cell, also where it leaves the picture."""
+    """The camera of a site's small grid: one pixel is one cell, also beyond the picture."""
     camera = site.frame.camera
     (fx, fy), (cx, cy) = camera.focal_px, camera.principal_px
     step = site.step
@@ -73,11 +73,11 @@ def with_seen(
     """The mirror's map and the light it points to: of the picture, a render, and guesses.
 
     Where the picture itself shows what the road mirrors, it is sharper than any render, and knows
-    of things that moved while nobody tracked them; a render's surface takes its place only where it
-    lies before it. Where the picture does not show it, the render does. A render's surface that the
-    picture sees through was not there at this moment, and where the render is open it may not know
-    all: what is guessed there stays, unless the mirrored ray leaves the picture. There nothing is
-    known but the render, and no surface is the sky.
+    of things that moved while nobody tracked them. Where it does not, the render does, if it is
+    sure: what is half
+    transparent there, or behind what is guessed, or what the picture sees through, leaves the guess
+    in its place. Where the render is open, too, unless the mirrored ray leaves the picture: there
+    nothing is known but the render, and no surface is the sky.
 
     Args:
         site: The frame.
@@ -103,16 +103,18 @@ def with_seen(
     columns = np.clip(np.round(rays[..., 0] * view.fx + view.cx), 0, shape[1] - 1).astype(np.intp)
     on_lines = np.arange(shape[0])[:, None], columns
     place = places(view, seen.depth_m)
-    opaque = (seen.opacity >= LEAST_OPACITY) & (seen.depth_m > 0)
-    gone = (opaque & _seen_through(site, view, place))[on_lines]
-    opaque = opaque[on_lines] & (climb < 0)
-    shown_depth_m = _shown_depth_m(site, guessed, rays, climb)
-    nearer = seen.depth_m[on_lines] < NEARER * shown_depth_m
-    own = opaque & ~gone & nearer
-    kept = np.isfinite(shown_depth_m) | gone | opaque | _goes_into(view, shape, rays, climb)
+    is_there = seen.depth_m > 0
+    gone = (is_there & _seen_through(site, view, place))[on_lines]
+    depth_m, opacity = seen.depth_m[on_lines], np.where(is_there, seen.opacity, 0.0)[on_lines]
+    shown = _is_shown(site, guessed, rays, climb)
+    into = _goes_into(view, shape, rays, climb)
+    behind = into & (depth_m > _guessed_depth_m(guessed, climb) / BEHIND)
+    sure = (opacity >= SURE_OPACITY) & (climb < 0) & ~gone & ~behind
+    own = sure & ~shown
+    kept = shown | gone | into | (opacity >= LEAST_OPACITY)
     kept &= ~own & (guessed.source >= 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        way = np.clip(1.0 + view.above_m / (climb * seen.depth_m[on_lines]), 0.0, 1.0)
+        way = np.clip(1.0 + view.above_m / (climb * depth_m), 0.0, 1.0)
     # Where the render and the picture are silent is the sky, infinitely far.
     spread = np.where(own, way, np.where(kept, guessed.spread, 1.0)).astype(np.float32)
     cells = np.arange(shape[0] * shape[1], dtype=np.int32).reshape(shape)
@@ -172,10 +174,10 @@ def _seen_through(site: Site, view: View, place: Float32) -> NDArray[np.bool_]:
     return inside & (nearest[row, column] > THROUGH * place[..., 2])
 
 
-def _shown_depth_m(site: Site, guessed: MirrorMap, rays: Float32, climb: Float32) -> Float32:
-    """(h, w) depth of the mirror image where the picture shows what is mirrored, else infinite.
+def _is_shown(site: Site, guessed: MirrorMap, rays: Float32, climb: Float32) -> NDArray[np.bool_]:
+    """Where (h, w) the picture itself shows what is mirrored.
 
-    What was guessed about a surface goes on where its own mirror image is not.
+    What is guessed about a surface is where the mirror image of what is seen of it is not.
     """
     width = site.shape[1]
     view = guessed.view
@@ -190,8 +192,8 @@ def _shown_depth_m(site: Site, guessed: MirrorMap, rays: Float32, climb: Float32
     with np.errstate(divide="ignore", invalid="ignore"):
         image_row = view.fy * down / depth + view.cy
     rows = np.arange(site.shape[0])[:, None]
-    is_shown = (guessed.source >= 0) & (depth > 0) & (np.abs(image_row - rows) <= OWN_ROWS)
-    return np.where(is_shown, depth, np.float32(np.inf)).astype(np.float32)
+    near: NDArray[np.bool_] = np.abs(image_row - rows) <= OWN_ROWS
+    return near & (guessed.source >= 0) & (depth > 0)
 
 
 def _rays_on_lines(view: View, shape: tuple[int, int]) -> tuple[Float32, Float32]:
@@ -202,6 +204,12 @@ def _rays_on_lines(view: View, shape: tuple[int, int]) -> tuple[Float32, Float32
     x = (down * (view.fx * view.nx + view.cx * view.nz) + scale * lines - view.cx) / view.fx
     y = (rows - view.cy) / view.fy
     return np.stack([x, y], axis=-1), view.nx * x + view.ny * y + view.nz
+
+
+def _guessed_depth_m(guessed: MirrorMap, climb: Float32) -> Float32:
+    """(h, w) depth of the mirror image that a map's spread tells of; infinite for the sky."""
+    short = np.where(climb < 0, climb, -1.0) * np.minimum(guessed.spread - 1.0, -1e-6)
+    return np.where(guessed.source >= 0, guessed.view.above_m / short, np.inf).astype(np.float32)
 
 
 def _goes_into(

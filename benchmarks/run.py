@@ -12,14 +12,25 @@ import cv2
 import numba
 import torch
 
-from benchmarks import crowds, editing, fidelity, growth, overlays, plot, sample, stages
+from benchmarks import (
+    crowds,
+    editing,
+    fidelity,
+    gaussians,
+    gaussians_plot,
+    growth,
+    overlays,
+    plot,
+    sample,
+    stages,
+)
 from benchmarks.report import write_results
 
 OUT = Path("out/bench")
 
 
 def main() -> None:
-    """Run every benchmark on one thread; write the numbers and the plot of the growth."""
+    """Run every benchmark on one thread; write the numbers and the plots of the growth."""
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     numba.set_num_threads(1)
@@ -31,10 +42,13 @@ def main() -> None:
         "sample": sample.measure(),
         "stages": stages.measure(),
         "growth": growth.measure(),
+        "gaussians": gaussians.measure(),
     }
     write_results(OUT / "results.json", results)
     plot.draw(results["growth"], OUT / "scaling.png")
-    print(f"\nall numbers: {OUT / 'results.json'}; growth of the cost: {OUT / 'scaling.png'}")
+    gaussians_plot.draw(results["gaussians"], OUT / "gaussians.png")
+    pictures = f"{OUT / 'scaling.png'}, {OUT / 'gaussians.png'}"
+    print(f"\nall numbers: {OUT / 'results.json'}; growth of the cost: {pictures}")
 
 
 if __name__ == "__main__":

@@ -47,3 +47,11 @@ def ambience() -> Ambience:
         ground=np.full(3, 0.12),
         airlight=np.array([0.55, 0.56, 0.57]),
     )
+
+
+@pytest.fixture(scope="session")
+def gaussian_scene(tmp_path_factory: pytest.TempPathFactory) -> WeatherScene:
+    """The tiny street of Gaussians with the styles rain, snow and fog; not to be harmed."""
+    from gaussian_clip import built
+
+    return built(tmp_path_factory.mktemp("gaussians") / "scene")

@@ -4,8 +4,11 @@ import time
 
 import numpy as np
 import pytest
+import torch
+from oracles import reference_gaussians
+from oracles.random_gaussians import KINDS, LEAVES, case
 
-from benchmarks import editing
+from benchmarks import editing, gaussians, gaussians_peer
 from benchmarks.drawn import fragments
 from benchmarks.editing import (
     BACKGROUNDS,
@@ -20,6 +23,7 @@ from benchmarks.editing import (
     part_ratios,
     with_traffic,
 )
+from benchmarks.gaussians_scene import lens, street_of
 from benchmarks.growth import fitted_power
 from benchmarks.overlays import COPY, FAR_COPY, HEIGHT, WHOLE, air_only, ratios, renders
 from benchmarks.report import Row
@@ -163,6 +167,59 @@ def test_a_power_law_is_recovered():
     assert fit.exponent == pytest.approx(0.85)
     assert fit.factor == pytest.approx(0.3)
     np.testing.assert_allclose(0.3 * x**0.85, fit.at(x))
+
+
+def test_a_growth_over_a_fixed_cost_is_recovered():
+    x = np.array([5e3, 1e4, 2e4, 5e4, 1e5, 2e5, 3e5])
+    fit = gaussians.fitted_growth(x, 20 + 0.002 * x**0.9)
+    assert fit.exponent == pytest.approx(0.9, abs=0.02)
+    assert fit.fixed == pytest.approx(20, rel=0.02)
+
+
+def test_the_rasterisers_targets_are_the_right_way_up():
+    """Ours at 1 ms and torch at 1000 ms meets the target, and the other way round misses it."""
+    slow = dict.fromkeys((gaussians.THEIRS, gaussians.PADDED), 1000.0) | {gaussians.OURS: 1.0}
+    fast = dict.fromkeys((gaussians.THEIRS, gaussians.PADDED), 1.0) | {gaussians.OURS: 1000.0}
+    assert [row.verdict for row in gaussians.ratios(slow)] == ["met", ""]
+    assert [row.value for row in gaussians.ratios(slow)] == [1000.0, 1000.0]
+    assert [row.verdict for row in gaussians.ratios(fast)] == ["missed", ""]
+    frame = {gaussians.FORWARD: 900.0, gaussians.BOTH: 2000.0, "harmonics": 200.0}
+    assert [row.verdict for row in gaussians.frame_rows(frame)] == ["met", "missed", ""]
+    assert gaussians.frame_rows(frame)[1].value == pytest.approx(1.1)
+
+
+@pytest.mark.parametrize("fragments", [gaussians_peer.GROUP_FRAGMENTS, 2**12, None])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_rasterisers_peer_draws_the_same(kind, fragments):
+    """Another picture, or another gradient, would be another task."""
+    made = case(kind, 0, background=False)
+    exact, single = made.in_type(torch.float64), made.in_type(torch.float32)
+    wanted = reference_gaussians.picture(*(getattr(exact, name) for name in LEAVES), made.pinhole)
+    found = gaussians_peer.draw(
+        *(getattr(single, name) for name in LEAVES), made.pinhole, fragments
+    )
+    sure = ~wanted.doubtful
+    for right, got in zip(wanted[:3], found, strict=True):
+        # Its float32 determinant cancels for needles.
+        assert (right - got).detach().abs()[sure].max() <= 5e-4
+    weight = torch.randn(37, 53, 3, generator=torch.Generator().manual_seed(0)) * sure[..., None]
+    (wanted.colours * weight).sum().backward()
+    (found[0] * weight).sum().backward()
+    for name in LEAVES:
+        right, got = getattr(exact, name).grad, getattr(single, name).grad
+        assert (right - got).norm() <= 5e-4 * right.norm(), name
+
+
+def test_the_street_of_gaussians_is_covered():
+    street, pinhole = street_of(3_000), lens(124, 38)
+    assert all(torch.equal(a, b) for a, b in zip(street, street_of(3_000), strict=True))
+    drawn = gaussians.ours(street, pinhole)
+    assert (drawn.opacity[25:] > 0.9).all()  # the road below the horizon has no holes
+    assert (drawn.opacity[:5, 58:66] == 0).all()  # and above its end is the sky
+    assert 2 < drawn.depth_m[37, 62] < 8 < drawn.depth_m[20, 62]
+    both = gaussians.both(street, lambda leaves: gaussians.ours(leaves, pinhole))
+    both()
+    assert all(leaf.grad is None for leaf in street)  # its own leaves carry the gradients
 
 
 def test_fragments_are_the_pixels_inside_the_ellipses():

@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from gaussian_clip import GaussianClip, known
 from numpy.typing import NDArray
 from tiny_clip import digests_of
 
@@ -21,6 +22,7 @@ from weather_aug.clip.types import FrameKey
 from weather_aug.render.options import RenderOptions
 from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.scene.scene import WeatherScene
+from weather_aug.scene.viewpoint import Viewpoint
 from weather_aug.timeline import WeatherTimeline
 from weather_aug.view.sheet import states
 from weather_aug.view.video import drive_frames, parked_frames
@@ -358,6 +360,13 @@ USAGE = {
     "unknown scheme": ("build sky:/data --out {new}", "no scheme 'sky'"),
     "no scheme": ("build data --out {new}", "has no scheme"),
     "unknown option": ("build street:?colour=red --out {new}", "no option 'colour'"),
+    "a fit of nothing": ("build " + STREET + " --out {new} --steps 9", "--steps needs --reconst"),
+    "a style of nothing": ("build " + STREET + " --out {new} --styles rain", "--styles needs"),
+    "an unknown style": (
+        "build " + STREET + " --out {new} --reconstruct --styles dusk",
+        "style 'dusk'",
+    ),
+    "a fit of no steps": ("build " + STREET + " --out {new} --reconstruct --steps 0", "steps"),
     "unknown editor": ("build " + STREET + " --out {new} --editor magic", "editor 'magic'"),
     "unknown weather": ("render {scene} --out {new} --weather hail", "weather type 'hail'"),
     "unknown severity": ("render {scene} --out {new} --severity mild", "severity 'mild'"),
@@ -586,3 +595,46 @@ def test_the_demo_ends_with_a_sheet(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert sheet.shape[1] > 1000
     assert len(np.unique(sheet.reshape(-1, 3), axis=0)) > 1000, "pictures, not paper"
     assert WeatherScene.load(out / "scene", verify=True).cameras == ("left", "front", "right")
+
+
+def test_a_scene_is_shown_from_elsewhere(
+    gaussian_scene: WeatherScene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """--viewpoint, --turn, --style and --without-actors, as `WeatherScene.render` takes them."""
+    folder, out = gaussian_scene.path, tmp_path / "out"
+    choices = "--viewpoint 1 0.2 0 --turn 3 0 0 --style snow --amount 0.5 --without-actors 7"
+    main(["render", str(folder), "--weather", "snow", "--out", str(out), *choices.split()])
+    key = gaussian_scene.keys[1]
+    shot = gaussian_scene.render(
+        key,
+        Weather.snow("heavy"),
+        viewpoint=Viewpoint(lateral_m=1, height_m=0.2, yaw_deg=3),
+        style="snow",
+        amount=0.5,
+        without_actors=(7,),
+    )
+    picture = cv2.imread(str(out / f"{key}.png"))[..., ::-1]
+    assert (picture == shot.image).all()
+    capsys.readouterr()
+    main(["inspect", str(folder)])
+    assert "Gaussians, styles: rain, snow, fog" in capsys.readouterr().out
+
+
+def test_a_build_says_what_it_reconstructed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("weather_aug.clip.open.open_clip", lambda spec: GaussianClip())
+    with known():
+        main(["build", "any", "--out", str(tmp_path / "s"), "--reconstruct", "--styles", "snow"])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"6 frames of front in {tmp_path / 's'}"
+    assert lines[1].endswith("Gaussians of 6 frames (psnr_db 99, ssim 1)")
+
+
+def test_choices_of_other_pictures_need_them(
+    gaussian_scene: WeatherScene, tiny_scene: WeatherScene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, line = refused(["render", str(tiny_scene.path), "--style", "snow"], capsys)
+    assert code == 2 and "--reconstruct" in line
+    code, line = refused(["render", str(gaussian_scene.path), "--amount", "0.5"], capsys)
+    assert code == 2 and "--amount needs --style" in line

@@ -31,6 +31,7 @@ from weather_aug.errors import (
 from weather_aug.scene import build as building
 from weather_aug.scene import store
 from weather_aug.scene.layers import Street
+from weather_aug.scene.route import street_axes
 from weather_aug.scene.scene import WeatherScene
 
 WORK = ".building"
@@ -156,7 +157,7 @@ def test_street_axes_are_the_way_the_rig_went(tiny_scene: WeatherScene) -> None:
 def test_street_axes_of_a_rig_that_stands_are_the_first_cameras_view() -> None:
     entry = {"camera": "front", "world_from_camera": TinyClip().camera(FrameKey(0, "right"))}
     pose = entry["world_from_camera"].world_from_camera.tolist()
-    axes = building.street_axes([{"camera": "a", "world_from_camera": pose}], np.array([0, 0, 2.0]))
+    axes = street_axes([{"camera": "a", "world_from_camera": pose}], np.array([0, 0, 2.0]))
     yaw = np.radians(-30)
     assert np.allclose([np.cos(yaw), np.sin(yaw), 0], axes[0])
     assert np.allclose([-np.sin(yaw), np.cos(yaw), 0], axes[1])
@@ -170,7 +171,7 @@ def test_up_is_not_assumed_to_be_an_axis() -> None:
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, :3, 3] = 10 * rng.normal(size=3)
     entries = [{"camera": "a", "world_from_camera": pose.tolist()} for pose in poses]
-    axes = building.street_axes(entries, up)
+    axes = street_axes(entries, up)
     assert np.allclose(np.eye(3), axes @ axes.T)
     assert np.isclose(1, np.linalg.det(axes))
     assert np.allclose(up, axes[2])

@@ -25,15 +25,16 @@ from weather_aug.clip.types import FrameKey
 from weather_aug.errors import IntegrityError, SceneError
 from weather_aug.gaussians.types import CLASSES, Actor, Gaussians, Reconstruction, Sky, Style
 from weather_aug.scene import reconstruction as storing
+from weather_aug.scene import reconstruction_record as records
 from weather_aug.scene import store
 from weather_aug.scene.reconstruction import (
     encode_geometry,
     encode_labels,
     encode_style,
     joined,
-    parse_reconstruction,
     read_reconstruction,
 )
+from weather_aug.scene.reconstruction_record import parse_reconstruction
 from weather_aug.scene.records import StoredFile
 from weather_aug.scene.scene import WeatherScene
 
@@ -51,7 +52,7 @@ def encoded(scene: Reconstruction) -> tuple[Entry, dict[str, bytes]]:
 def written(folder: Path, scene: Reconstruction) -> Reconstruction:
     """Through the folder and back."""
     entry, parts = encoded(scene)
-    (folder / storing.GAUSSIANS).mkdir(parents=True, exist_ok=True)
+    (folder / records.GAUSSIANS).mkdir(parents=True, exist_ok=True)
     for path, data in parts.items():
         (folder / path).write_bytes(data)
     files = {path: StoredFile(len(data), "") for path, data in parts.items()}
@@ -180,7 +181,7 @@ def test_arrays_are_mapped_and_cannot_be_written(tmp_path: Path) -> None:
 
 def test_files_are_what_numpy_reads_and_no_pickles(tmp_path: Path) -> None:
     written(tmp_path, tiny_reconstruction())
-    for path in (tmp_path / storing.GAUSSIANS).iterdir():
+    for path in (tmp_path / records.GAUSSIANS).iterdir():
         np.load(path, allow_pickle=False)
 
 
@@ -222,7 +223,7 @@ def folder(tiny_scene: WeatherScene, tmp_path: Path) -> Path:
     copy = Path(shutil.copytree(tiny_scene.path, tmp_path / "scene"))
     scene = tiny_reconstruction(styles=("rain",))
     entry, parts = encoded(scene)
-    (copy / storing.GAUSSIANS).mkdir()
+    (copy / records.GAUSSIANS).mkdir()
     for relative, data in parts.items():
         (copy / relative).write_bytes(data)
     listed = {p: {"size": len(d), "sha256": _files.sha256_of(d)} for p, d in parts.items()}
@@ -242,7 +243,7 @@ def rewrite(folder: Path, change: Callable[[Entry], object]) -> None:
 
 def plant(folder: Path, name: str, array: NDArray[Any]) -> None:
     """Replace an array and all that is said of it."""
-    path, data = storing.array_path(name), npy(array)
+    path, data = records.array_path(name), npy(array)
     (folder / path).write_bytes(data)
     listed = {"size": len(data), "sha256": _files.sha256_of(data)}
     rewrite(
@@ -261,7 +262,7 @@ def npy(array: NDArray[Any], *, allow_pickle: bool = False) -> bytes:
 
 
 def stored(folder: Path, name: str) -> NDArray[Any]:
-    return np.array(np.load(folder / storing.array_path(name)))
+    return np.array(np.load(folder / records.array_path(name)))
 
 
 def test_a_scene_gives_its_gaussians(folder: Path) -> None:
@@ -289,7 +290,7 @@ def test_opening_a_scene_does_not_read_its_gaussians(
 
 
 def test_a_file_that_is_cut_or_changed_is_found(folder: Path) -> None:
-    path = folder / storing.array_path("background_sh")
+    path = folder / records.array_path("background_sh")
     data = path.read_bytes()
     path.write_bytes(data[:-4])
     with pytest.raises(IntegrityError, match="background_sh"):
@@ -303,7 +304,7 @@ def test_a_file_that_is_cut_or_changed_is_found(folder: Path) -> None:
 
 
 def test_a_pickle_instead_of_an_array_is_not_loaded(folder: Path) -> None:
-    path = storing.array_path("support")
+    path = records.array_path("support")
     data = npy(np.array([{"a": 1}], object), allow_pickle=True)
     (folder / path).write_bytes(data)
     listed = {"size": len(data), "sha256": _files.sha256_of(data)}
@@ -403,7 +404,7 @@ def test_noise_in_an_array_gives_an_error_or_the_same_numbers(
     folder = tmp_path_factory.mktemp("noise")
     scene = tiny_reconstruction(spacing_m=2.0, styles=())
     entry, parts = encoded(scene)
-    (folder / storing.GAUSSIANS).mkdir()
+    (folder / records.GAUSSIANS).mkdir()
     name = sorted(parts)[zlib.crc32(data) % len(parts)]
     parts[name] = parts[name][:place] + data + parts[name][place + len(data) :]
     for path, content in parts.items():

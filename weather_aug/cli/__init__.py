@@ -1,4 +1,4 @@
-"""The command line: build | render | sweep | export | inspect | demo."""
+"""The command line: build | render | sweep | export | view | inspect | demo."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from tyro.conf import Positional
@@ -16,6 +16,7 @@ from tyro.conf import Positional
 from weather_aug import __version__, _files
 from weather_aug.cli.render import Render
 from weather_aug.cli.terminal import check_folder, complain, say, to_people
+from weather_aug.cli.view import View
 from weather_aug.errors import (
     ArgumentError,
     DataError,
@@ -45,6 +46,17 @@ class Build:
     """Types the scene is meant for."""
     overwrite: bool = False
     """Replace the scene that stands in `out`."""
+    reconstruct: bool = False
+    """Turn the frames into Gaussians, too, so that they can be rendered from elsewhere; takes
+    minutes."""
+    steps: int | None = None
+    """Of the fit; see `FitOptions` for this and the next two."""
+    count: int | None = None
+    """Gaussians at the most."""
+    scale: float | None = None
+    """Of the pictures' sides for the fit, in (0, 1]."""
+    styles: tuple[str, ...] | None = None
+    """Weathers whose colours the Gaussians learn; rain snow fog if not given."""
 
     def run(self) -> None:
         """Build and say what was made."""
@@ -59,8 +71,28 @@ class Build:
             weathers=self.weathers,
             progress=to_people(),
             overwrite=self.overwrite,
+            **self._reconstruction(),
         )
         say(f"{len(scene.keys)} frames of {', '.join(scene.cameras)} in {self.out}")
+        record = scene.manifest.reconstruction
+        if record is not None:
+            count = record.shapes["background_means_m"][0] + record.shapes["owners"][0]
+            told = ", ".join(f"{name} {value:.4g}" for name, value in record.fit.items())
+            say(f"{count} Gaussians of {len(record.cameras)} frames ({told})")
+
+    def _reconstruction(self) -> dict[str, Any]:
+        """Arguments of `WeatherScene.build`."""
+        numbers: dict[str, Any] = {"steps": self.steps, "count": self.count, "scale": self.scale}
+        given = {name: value for name, value in numbers.items() if value is not None}
+        if not self.reconstruct:
+            names = [*given, *(["styles"] if self.styles is not None else [])]
+            if names:
+                raise ArgumentError(f"--{names[0]} needs --reconstruct")
+            return {}
+        from weather_aug.gaussians.fit import FitOptions
+
+        chosen: dict[str, Any] = {"reconstruct": True, "reconstruction": FitOptions(**given)}
+        return chosen | ({} if self.styles is None else {"styles": self.styles})
 
 
 @dataclass(frozen=True)
@@ -224,6 +256,7 @@ Command = (
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Sweep, tyro.conf.subcommand("sweep")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Inspect, tyro.conf.subcommand("inspect")]
 )
 
@@ -319,6 +352,10 @@ def _inspect_scene(path: Path) -> list[str]:
     size_mib = sum(stored.size for stored in manifest.files.values()) / 2**20
     say(f"scene {scene.name}, digest {scene.digest[:12]}, editor {manifest.editor}")
     say(f"{len(scene.keys)} frames ({labelled} labelled) of {', '.join(scene.cameras)}")
+    if manifest.reconstruction is not None:
+        shapes, styles = manifest.reconstruction.shapes, manifest.reconstruction.styles
+        count = shapes["background_means_m"][0] + shapes["owners"][0]
+        say(f"{count} Gaussians, styles: {', '.join(styles) or 'none'}")
     say(f"{len(manifest.files)} files, {size_mib:.1f} MiB")
     return scene.damaged_files()
 

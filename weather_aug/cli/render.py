@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from functools import reduce
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from tyro.conf import Positional
@@ -58,6 +58,17 @@ class Render:
     """Expected number of resolved particles in a picture at the most."""
     without: tuple[str, ...] = ()
     """Effects to leave out, such as mirror lamps drops; see `RenderOptions.without`."""
+    viewpoint: tuple[float, float, float] | None = None
+    """Metres to the left of the recorded camera, above it, and ahead of it; of a scene that was
+    built with --reconstruct."""
+    turn: tuple[float, float, float] | None = None
+    """Degrees of yaw to the left, pitch upwards, and roll clockwise from the recorded camera."""
+    style: str | None = None
+    """Weather whose colours the Gaussians take, instead of the editor's: rain, snow or fog."""
+    amount: float = 1.0
+    """Of the style, in [0, 1]."""
+    without_actors: tuple[int, ...] = ()
+    """Track ids of moving objects to leave out."""
     labels: bool = False
     """Write the invalid masks too, and the remapped labels where there are labels."""
 
@@ -85,7 +96,7 @@ class Render:
         weather = self._weather(*shown_s(scene, keys))
         unlabelled = 0
         for key in tqdm(keys, desc="render", unit="frame", disable=not to_people()):
-            shot = scene.render(key, weather, seed=self.seed, options=options)
+            shot = scene.render(key, weather, seed=self.seed, options=options, **self._elsewhere())
             write_png(self.out / f"{key}.png", shot.image)
             if self.labels:
                 write_png(self.out / f"{key}_invIds.png", shot.invalid)
@@ -113,7 +124,9 @@ class Render:
         if self.parked_s is None:
             weather = self._weather(*video.shown_s(scene, keys))
             count = len(keys)
-            frames = video.drive_frames(scene, camera, weather, seed=self.seed, options=options)
+            frames = video.drive_frames(
+                scene, camera, weather, seed=self.seed, options=options, **self._elsewhere()
+            )
         else:
             key = FrameKey(self.time, camera) if self.time is not None else keys[len(keys) // 2]
             start_s, _ = video.shown_s(scene, [key])
@@ -131,6 +144,22 @@ class Render:
         shown = tqdm(frames, "render", count, unit="frame", disable=not to_people())
         count = video.write_video(path, shown, fps)
         say(f"{count} frames at {fps:g} per second in {path}")
+
+    def _elsewhere(self) -> dict[str, Any]:
+        """What makes it another picture than the recorded one, for `WeatherScene.render`."""
+        from weather_aug.scene.viewpoint import Viewpoint
+
+        if self.viewpoint is None and self.turn is None:
+            viewpoint = None
+        else:
+            none = (0.0, 0.0, 0.0)
+            viewpoint = Viewpoint(*(self.viewpoint or none), *(self.turn or none))
+        return {
+            "viewpoint": viewpoint,
+            "style": self.style,
+            "amount": self.amount,
+            "without_actors": self.without_actors,
+        }
 
     def _check(self) -> None:
         """Refuse flags that would mean nothing."""
@@ -174,9 +203,11 @@ _NEEDS = {
     "time": "parked_s",
     "start_s": "origin",
     "end_s": "origin",
+    "amount": "style",
 }
 _AGAINST = {
     "video": {"out", "labels"},
+    "parked_s": {"viewpoint", "turn", "style", "amount", "without_actors"},
     "timeline": {"weather", "severity", "falling", "origin", "start_s", "end_s"},
 }
 

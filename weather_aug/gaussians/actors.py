@@ -223,12 +223,6 @@ class ActorPoses(nn.Module):
             millimetres far from the world's origin.
     """
 
-    _rotations: Tensor
-    _places_m: Tensor
-    _steps: Tensor
-    _moments: Tensor
-    _residual: Tensor
-
     def __init__(
         self, actors: Sequence[Actor], origin_m: Sequence[float] = (0.0, 0.0, 0.0)
     ) -> None:
@@ -242,19 +236,15 @@ class ActorPoses(nn.Module):
             _windows(actor.times_s, start)
             for actor, start in zip(self.actors, self._starts, strict=False)
         ]
-        tables = {
-            "_rotations": recorded[:, :3, :3],
-            "_places_m": recorded[:, :3, 3] - np.asarray(origin_m, np.float64),
-            "_steps": np.concatenate([np.zeros((0, 4)), *steps]),
-            "_moments": np.concatenate(
-                [np.zeros((0, SMOOTHNESS_MOMENTS), np.int64), *(m for m, _ in windows)]
-            ),
-            "_residual": np.concatenate(
-                [np.zeros((0, SMOOTHNESS_MOMENTS)), *(w for _, w in windows)]
-            ),
-        }
-        for name, table in tables.items():
-            self.register_buffer(name, torch.from_numpy(table.copy()), persistent=False)
+        # No buffers, because `module.float()` would make them float32.
+        self._rotations = torch.from_numpy(recorded[:, :3, :3].copy())
+        self._places_m = torch.from_numpy(recorded[:, :3, 3] - np.asarray(origin_m, np.float64))
+        self._steps = torch.from_numpy(np.concatenate([np.zeros((0, 4)), *steps]))
+        none = np.zeros((0, SMOOTHNESS_MOMENTS))
+        self._moments = torch.from_numpy(
+            np.concatenate([none.astype(np.int64), *(moments for moments, _ in windows)])
+        )
+        self._residual = torch.from_numpy(np.concatenate([none, *(part for _, part in windows)]))
         self.rotations_rad = nn.Parameter(torch.zeros(len(recorded), 3))
         """Of all moments of all actors, one after the other."""
         self.translations_m = nn.Parameter(torch.zeros(len(recorded), 3))
@@ -266,20 +256,20 @@ class ActorPoses(nn.Module):
         Gaussians away.
         """
         places = [_place_in(actor.times_s, time_s) for actor in self.actors]
-        device = self.rotations_rad.device
         present = torch.tensor([place is not None for place in places], dtype=torch.bool)
         firsts = torch.tensor([place[0] if place else 0 for place in places], dtype=torch.int64)
         share = torch.tensor([place[1] if place else 0.0 for place in places], dtype=torch.float64)
-        before = (firsts + torch.from_numpy(self._starts[:-1])).to(device)
-        share = share.to(device)
+        before = firsts + torch.from_numpy(self._starts[:-1])
         after = before + (share > 0)
+        device = self.rotations_rad.device
+        present, share = present.to(device), share.to(device)
         deltas = quaternions_of_vectors(self.rotations_rad.double())
-        end = product(self._steps[before], deltas[after])
+        end = product(self._steps[before].to(device), deltas[after])
         turn = slerped_tensor(deltas[before], end, share)
-        rotations = self._rotations[before] @ matrices_of(turn)
-        refined_m = self._places_m + self.translations_m.double()
+        rotations = self._rotations[before].to(device) @ matrices_of(turn)
+        refined_m = self._refined_m()
         middle_m = torch.lerp(refined_m[before], refined_m[after], share[:, None])
-        return _rigid(rotations, middle_m).float(), present.to(device)
+        return _rigid(rotations, middle_m).float(), present
 
     def smoothness(self) -> Tensor:
         """Mean distance, metres, of places from the straight line through those around them.
@@ -289,9 +279,13 @@ class ActorPoses(nn.Module):
         """
         if len(self._moments) == 0:
             return self.translations_m.sum() * 0.0
-        refined_m = self._places_m + self.translations_m.double()
-        residual_m = (self._residual[..., None] * refined_m[self._moments]).sum(dim=1)
+        residual = self._residual.to(self.translations_m.device)
+        residual_m = (residual[..., None] * self._refined_m()[self._moments]).sum(dim=1)
         return residual_m.abs().sum(dim=-1).mean().float()
+
+    def _refined_m(self) -> Tensor:
+        """Places of all moments, from the origin."""
+        return self._places_m.to(self.translations_m.device) + self.translations_m.double()
 
     def refined(self) -> tuple[Actor, ...]:
         """The actors with their refined poses."""

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from weather_aug.clip.types import Camera, FrameKey
 from weather_aug.errors import ArgumentError, printable
+from weather_aug.gaussians.exposure import nearest
 from weather_aug.gaussians.gather import Gathered, Weights, gather, rasterised, sky_of
 from weather_aug.gaussians.rasterise import NEAR_M, Drawn
 from weather_aug.gaussians.rotations import matrices_of
@@ -74,7 +75,8 @@ def view(
         amount: In 0..1, of the style.
         without: Track ids of actors to leave out.
         poses: (4, 4) by track id: actors put elsewhere.
-        key: A recorded frame whose exposure to apply to the image; the scene's own if None.
+        key: A frame whose exposure, or that of its camera's recorded frame nearest in time, to
+            apply to the image; the scene's own colours if None.
         want: Which of `FIELDS` to draw; each costs time.
         threads: Of the rasteriser. The result does not depend on it.
 
@@ -92,12 +94,13 @@ def view(
             without=without,
             poses=poses,
             origin_m=camera.centre_world,
+            colours="image" in wanted,
             labels="label" in wanted,
         )
         planes = _planes(reconstruction, camera, gathered, wanted)
         drawn, parts = _drawn(gathered, camera, planes, threads)
     opacity = drawn.opacity.numpy()
-    through = 1 - opacity
+    through = np.float32(1) - opacity
     image = depth_m = label = seen = normals = None
     if "image" in wanted:
         sky = sky_of(reconstruction, style, amount)
@@ -253,12 +256,13 @@ def _bytes(image: Float32, exposure: Float32 | None) -> NDArray[np.uint8]:
 
 
 def _exposure(reconstruction: Reconstruction, key: FrameKey) -> Float32:
-    if key not in reconstruction.exposures:
+    cameras = {other.camera for other in reconstruction.exposures}
+    if key.camera not in cameras:
         raise ArgumentError(
-            f"frame {printable(key)} has no exposure in the reconstruction; take one of its "
-            f"{len(reconstruction.exposures)} keys, or key=None for the scene's own colours"
+            f"no exposure of camera {printable(key.camera)!r} is known; take a key of "
+            f"{', '.join(sorted(cameras)) or 'none'}, or key=None for the scene's own colours"
         )
-    return reconstruction.exposures[key]
+    return nearest(reconstruction.exposures, key)
 
 
 def _known_fields(want: Collection[str]) -> frozenset[str]:

@@ -98,7 +98,7 @@ def exposed(image: Tensor, matrix: Tensor) -> Tensor:
             f"{tuple(matrix.shape)}"
         )
     if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (image, matrix)):
-        out: Tensor = _Exposed.apply(image, matrix)  # type: ignore[no-untyped-call]
+        out: Tensor = _Exposed.apply(image, matrix)
         return out
     return image @ matrix[:, :3].T + matrix[:, 3]
 

@@ -67,8 +67,8 @@ def _nearest(plane: NDArray[Any] | None, height: int, width: int) -> NDArray[Any
     return np.ascontiguousarray(plane[rows[:, None], columns])
 
 
-def target_of(frame: Frame) -> Target:
-    """A frame as tensors."""
+def target_of(frame: Frame, device: torch.device | str = "cpu") -> Target:
+    """A frame as tensors on a device."""
     shape = frame.image.shape[:2]
     image = torch.from_numpy(frame.image).float() / 255.0
     if frame.depth_m is None:
@@ -85,10 +85,10 @@ def target_of(frame: Frame) -> Target:
         is_known = np.asarray(frame.label != 255)
     return Target(
         frame,
-        SsimTarget(image),
-        torch.from_numpy(depth),
-        torch.from_numpy(is_sky),
-        torch.from_numpy(is_known),
+        SsimTarget(image.to(device)),
+        torch.from_numpy(depth).to(device),
+        torch.from_numpy(is_sky).to(device),
+        torch.from_numpy(is_known).to(device),
     )
 
 

@@ -36,13 +36,14 @@ class Gathered(NamedTuple):
     opacities: Tensor
     """(R,) in 0..1."""
     sh: Tensor
-    """(R, K, 3); an actor's are in its own axes, so that its look turns with it."""
+    """(R, K, 3) in world axes; of an actor as it was recorded, which `colours_seen` allows for."""
     class_scores: Tensor
-    """(R, C); C = 0 if unlabelled or not asked for."""
+    """(R, C); C = 0 if unlabelled or left out."""
     rows: Tensor
     """(R,) int64: place of each among the background's Gaussians followed by all actors'."""
-    turns: Tensor
-    """(A, 3, 3) world_from_actor of the last A rows, which are the actors'."""
+    turns: Tensor | None
+    """(A, 3, 3) how the last A rows, which are the actors', were turned by `poses`; None if none
+    was."""
     origin_m: Float64
     """(3,) of the tensors, in the world."""
 
@@ -58,10 +59,11 @@ class Gathered(NamedTuple):
         """
         sh = self.sh if sh is None else sh
         towards = self.means_m - _tensor(np.asarray(centre_m, np.float64) - self.origin_m)
-        first = len(towards) - len(self.turns)
-        # A row vector times world_from_actor is in the actor's axes.
-        local = torch.bmm(towards[first:, None], self.turns)[:, 0]
-        towards = torch.cat([towards[:first], local])
+        if self.turns is not None:
+            first = len(towards) - len(self.turns)
+            # A row vector times a rotation is turned back by it.
+            back = torch.bmm(towards[first:, None], self.turns)[:, 0]
+            towards = torch.cat([towards[:first], back])
         return colours_seen(sh, towards, torch.zeros(3), degree)
 
 
@@ -74,6 +76,7 @@ def gather(
     without: Collection[int] = (),
     poses: Mapping[int, ArrayLike] | None = None,
     origin_m: ArrayLike = (0.0, 0.0, 0.0),
+    colours: bool = True,
     labels: bool = True,
 ) -> Gathered:
     """The background and the actors present at `time_s`, each at its place.
@@ -89,6 +92,7 @@ def gather(
         poses: `world_from_actor` (4, 4) by track id: puts actors elsewhere, also while they were
             not there.
         origin_m: (3,) of the tensors returned. The camera's centre keeps the most digits.
+        colours: Whether to gather `sh`; else it is (R, 0, 3).
         labels: Whether to gather the class scores.
 
     Raises:
@@ -99,6 +103,7 @@ def gather(
     origin = np.asarray(origin_m, np.float64)
     background, shells = reconstruction.background, reconstruction.actor_gaussians
     present = _present(reconstruction, time_s, without, poses or {})
+    turns = _turns(reconstruction, time_s, present) if poses else None
     matrices = np.array([*present.values()]).reshape(-1, 4, 4)
     matrices[:, :3, 3] -= origin
     place = np.full(len(reconstruction.actors), -1)
@@ -120,6 +125,8 @@ def gather(
         ),
     )
 
+    count = len(background) + len(picked)
+
     def both(name: str) -> Tensor:
         return _joined([getattr(background, name), getattr(shells, name)[picked]])
 
@@ -128,14 +135,12 @@ def gather(
         quaternions=torch.cat([_tensor(background.quaternions), quaternions]),
         scales_m=both("log_scales").exp_(),
         opacities=both("logit_opacities").sigmoid_(),
-        sh=_blended_sh(reconstruction, weights, picked),
-        class_scores=both("class_scores")
-        if labels
-        else torch.zeros(len(background) + len(picked), 0),
+        sh=_blended_sh(reconstruction, weights, picked) if colours else torch.zeros(count, 0, 3),
+        class_scores=both("class_scores") if labels else torch.zeros(count, 0),
         rows=torch.from_numpy(
             np.concatenate([np.arange(len(background)), len(background) + picked])
         ),
-        turns=_tensor(matrices[:, :3, :3])[owners],
+        turns=None if turns is None else turns[owners],
         origin_m=origin,
     )
 
@@ -219,6 +224,18 @@ def _present(
         elif (pose := pose_at(actor, time_s)) is not None:
             present[index] = pose
     return present
+
+
+def _turns(reconstruction: Reconstruction, time_s: float, present: Mapping[int, Float64]) -> Tensor:
+    """(A, 3, 3) from how each actor stood when it was recorded to how it stands now."""
+    turns = []
+    for index, pose in present.items():
+        actor = reconstruction.actors[index]
+        nearest_s = float(np.clip(time_s, actor.times_s[0], actor.times_s[-1]))
+        recorded = pose_at(actor, nearest_s)
+        assert recorded is not None
+        turns.append(pose[:3, :3] @ recorded[:3, :3].T)
+    return _tensor(np.array(turns).reshape(-1, 3, 3))
 
 
 def _rigid(track_id: int, pose: ArrayLike) -> Float64:

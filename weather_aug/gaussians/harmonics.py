@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from weather_aug._extras import require
 from weather_aug.errors import ArgumentError
 from weather_aug.gaussians import harmonics_kernels as kernels
 from weather_aug.gaussians.types import SH_COEFFICIENTS
@@ -19,13 +20,14 @@ def colours_seen(
     """SRGB (N, 3), at least 0, of Gaussians seen from `centre_m`; all inputs carry gradients.
 
     Args:
-        sh: (N, K, 3) float32 coefficients on the CPU.
+        sh: (N, K, 3) float32 coefficients; those of CUDA are gsplat's work.
         means_m: (N, 3) float32.
         centre_m: (3,) of the camera, in the same axes.
         degree: Highest degree to use; all of `sh` if None.
 
     Raises:
-        ArgumentError: If shapes disagree or `sh` has no such degree.
+        ArgumentError: If shapes or types disagree, or `sh` has no such degree.
+        MissingExtraError: If CUDA tensors are given and gsplat is not installed.
 
     Sources:
         3DGS (Kerbl et al. 2023): real spherical harmonics, colour = max(0, 0.5 + Σ c·Y).
@@ -41,6 +43,13 @@ def colours_seen(
     degree = highest if degree is None else degree
     if not 0 <= degree <= highest:
         raise ArgumentError(f"degree must be in 0..{highest} for sh of this size, got {degree}")
+    for name, value in (("sh", sh), ("means_m", means_m), ("centre_m", centre_m)):
+        if value.dtype != torch.float32:
+            raise ArgumentError(f"{name} must be float32, got {value.dtype}")
+    if sh.is_cuda:
+        gsplat = require("gsplat", extra="gsplat", to="draw Gaussians with CUDA")
+        blended: Tensor = gsplat.spherical_harmonics(degree, means_m - centre_m, sh)
+        return (blended + 0.5).clamp_min(0.0)
     colours: Tensor = _Colours.apply(sh, means_m, centre_m, SH_COEFFICIENTS[degree])
     return colours
 

@@ -21,12 +21,14 @@ from numpy.typing import NDArray
 
 from weather_aug._checks import finite
 from weather_aug._keys import check_seed
+from weather_aug.clip.poses import inverse_motion
 from weather_aug.clip.types import Box, Float64, Frame
 from weather_aug.errors import ArgumentError
 from weather_aug.gaussians.points import (
     BOX_MARGIN_M,
     View,
     inside,
+    moved,
     points_camera,
     points_world,
     seen_best,
@@ -237,20 +239,20 @@ def _patches(
     colours = means_of(view.colours[rows, columns].astype(np.float64), cells)
     depth = points[:, 2:]
     focal = view.lens[:2] * view.stride_px
-    # Along the picture's axes the surface runs by these vectors a pixel; the depth's part is kept
-    # to what a fit can hold.
-    steps = np.clip(-(depth**2) * slopes, -_MAX_RATIO * depth / focal, _MAX_RATIO * depth / focal)
+    # Along the picture's axes the surface runs by these vectors a pixel.
+    steps = -(depth**2) * slopes
     tangents = steps[:, :, None] * (points / depth)[:, None, :]
     tangents[:, 0, 0] += depth[:, 0] / focal[0]
     tangents[:, 1, 1] += depth[:, 0] / focal[1]
     covariances = np.einsum("nki,nkj->nij", tangents, tangents)
     squares, axes = np.linalg.eigh(covariances)
     sizes = np.sqrt(np.maximum(squares, 0.0))
-    sizes[:, 1] = np.maximum(sizes[:, 1], sizes[:, 2] / _MAX_RATIO)
+    # Seen at a grazing angle a pixel is longer than a fit can hold.
+    sizes[:, 2] = np.minimum(sizes[:, 2], _MAX_RATIO * sizes[:, 1])
     sizes[:, 0] = np.maximum(_FLATNESS * sizes[:, 1], sizes[:, 2] / _MAX_RATIO)
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
     rotation = view.world_from_camera[:3, :3]
-    means = points @ rotation.T + view.world_from_camera[:3, 3]
+    means = moved(points, view.world_from_camera)
     return means, _quaternions(rotation @ axes), _SPREAD * cell_px * sizes, colours
 
 
@@ -285,7 +287,7 @@ def _points_in_box(frame: Frame, box: Box) -> tuple[Float64, Float64, Float64]:
     points = points_world(view, rows, columns)
     within = inside(points, box)
     rows, columns = rows[within], columns[within]
-    own = (points[within] - box.world_from_box[:3, 3]) @ box.world_from_box[:3, :3]
+    own = moved(points[within], inverse_motion(box.world_from_box))
     colours = view.colours[rows, columns].astype(np.float64)
     own_depth = view.depth_m[rows, columns].astype(np.float64)
     return own, colours, own_depth / view.lens[0]

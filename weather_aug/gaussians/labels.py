@@ -96,7 +96,7 @@ def recorded_support(
     background = len(reconstruction.background)
     support = torch.zeros(background + len(reconstruction.actor_gaussians))
     for frame in tqdm(frames, desc="support", unit="frame", disable=not progress):
-        gathered = gather(reconstruction, frame.time_s, labels=False)
+        gathered = gather(reconstruction, frame.time_s, colours=False, labels=False)
         plane = torch.zeros(len(gathered.rows), 1, requires_grad=True)
         drawn = rasterised(gathered, camera_of(reconstruction, frame), plane, threads)
         (weights,) = torch.autograd.grad(drawn.colours, plane, torch.ones_like(drawn.colours))
@@ -122,7 +122,7 @@ def _handed_out(
     threads: int,
 ) -> tuple[Tensor, Tensor]:
     """Rows of the Gaussians in a frame, and what each gets of the labelled pixels by class."""
-    gathered = gather(reconstruction, frame.time_s, labels=False)
+    gathered = gather(reconstruction, frame.time_s, colours=False, labels=False)
     own = scores[gathered.rows].requires_grad_()
     drawn = rasterised(gathered, camera_of(reconstruction, frame), own, threads)
     likelihood = drawn.colours.detach().clone()

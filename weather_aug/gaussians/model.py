@@ -106,7 +106,8 @@ class Model:
                 },
                 {"params": [self.poses.rotations_rad], "lr": actors.ROTATION_LEARNING_RATE},
                 {"params": [self.poses.translations_m], "lr": actors.TRANSLATION_LEARNING_RATE},
-            ]
+            ],
+            fused=True,
         )
 
     @property

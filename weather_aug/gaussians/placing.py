@@ -43,9 +43,7 @@ def placed(
     given = (means_m, quaternions, offsets_m, poses, turns)
     if all(tensor.device.type == "cpu" and tensor.dtype == torch.float32 for tensor in given):
         bases = basis_by_actor.detach().float()
-        world: tuple[Tensor, Tensor] = _Placed.apply(  # type: ignore[no-untyped-call]
-            *given, owners, bases
-        )
+        world: tuple[Tensor, Tensor] = _Placed.apply(*given, owners, bases)
         return world
     basis = basis_by_actor.index_select(0, owners).to(offsets_m)
     here_m = means_m + torch.bmm(basis[:, None, :], offsets_m)[:, 0]

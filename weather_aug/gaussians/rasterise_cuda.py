@@ -51,12 +51,14 @@ def drawn(
             f"gsplat is installed but its CUDA code cannot be loaded ({printable(error)}); it is "
             "compiled on first use and needs the CUDA toolkit"
         ) from error
-    centres = meta["means2d"]
-    if centres.requires_grad:
-        centres.retain_grad()
+    means2d = meta["means2d"]
+    centres = (means2d[0] - 0.5).detach()
+    if means2d.requires_grad:
+        # gsplat draws from its own tensor; whoever reads the gradient of ours finds that one's.
+        means2d.register_hook(lambda gradient: setattr(centres, "grad", gradient[0]))
     radii = meta["radii"][0].float()
     radii = radii.amax(dim=-1) if radii.ndim == 2 else radii
     opacity = opacity[0, ..., 0]
     return Blended(
-        blended[0, ..., :-1], opacity, 1.0 - opacity, blended[0, ..., -1], centres[0], radii
+        blended[0, ..., :-1], opacity, 1.0 - opacity, blended[0, ..., -1], centres, radii
     )

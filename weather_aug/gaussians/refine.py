@@ -37,8 +37,6 @@ class CameraRefinement(nn.Module):
             then keep millimetres far from the world's origin.
     """
 
-    _recorded: Tensor
-
     def __init__(
         self, cameras: Mapping[FrameKey, Camera], origin_m: Sequence[float] = _HERE
     ) -> None:
@@ -46,8 +44,8 @@ class CameraRefinement(nn.Module):
         self.cameras = {FrameKey(*key): camera for key, camera in cameras.items()}
         self._rows = {key: row for row, key in enumerate(self.cameras)}
         recorded = [camera_from_world(camera, origin_m) for camera in self.cameras.values()]
-        table = torch.from_numpy(np.array(recorded).reshape(-1, 4, 4))
-        self.register_buffer("_recorded", table, persistent=False)
+        # No buffer, because `module.float()` would make it float32.
+        self._recorded = torch.from_numpy(np.array(recorded).reshape(-1, 4, 4))
         self.turns_rad = nn.Parameter(torch.zeros(len(recorded), 3))
         self.shifts_m = nn.Parameter(torch.zeros(len(recorded), 3))
 
@@ -60,8 +58,9 @@ class CameraRefinement(nn.Module):
         row = self._row(key)
         # Of the inverse motion: x = turnᵀ (recorded x - shift).
         turn, shift = self._motion(row)
+        recorded = self._recorded[row].to(turn.device)
         inverse = torch.cat([turn.T, -(turn.T @ shift)[:, None]], dim=1)
-        return torch.cat([inverse @ self._recorded[row], self._recorded[row, 3:]]).float()
+        return torch.cat([inverse @ recorded, recorded[3:]]).float()
 
     def refined(self, key: FrameKey, camera: Camera | None = None) -> Camera:
         """The camera of a key with its refined pose; as it was, bit for bit, if nothing was learnt.

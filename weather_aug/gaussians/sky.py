@@ -32,7 +32,7 @@ Float32 = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 
 SIZE = 256
-"""Texels along the side of a face: 0.22 to 0.45 degrees each."""
+"""Texels along the side of a face: 0.45 degrees each in its middle, 0.15 across a corner."""
 MAX_SIZE = 4096
 LEARNING_RATE = 0.01
 """For Adam (OmniRe)."""
@@ -86,9 +86,10 @@ class SkyMap(nn.Module):
         sums = (inner if inner.any() else rim).reshape(6, size, size, 4)
         weights = sums[..., 3:]
         colours = (sums[..., :3] / np.where(weights > 0, weights, 1)).astype(np.float32)
+        known = weights[..., 0] > 0
         sky = cls(size)
         with torch.no_grad():
-            sky.faces.copy_(torch.from_numpy(_filled(colours, weights[..., 0] > 0)))
+            sky.faces.copy_(torch.from_numpy(_filled(colours, known.astype(np.float32))))
         sky.seen = torch.from_numpy((inner + rim)[:, 3] > 0).reshape(6, size, size)
         return sky
 
@@ -99,7 +100,7 @@ class SkyMap(nn.Module):
         """
         flat = directions_world.detach().reshape(-1, 3)
         if _is_compiled(self.faces):
-            sampled: Tensor = _Sampled.apply(self.faces, flat)  # type: ignore[no-untyped-call]
+            sampled: Tensor = _Sampled.apply(self.faces, flat)
         else:
             sampled = _sampled(self.faces, flat)
         return sampled.reshape(directions_world.shape)
@@ -129,7 +130,7 @@ class SkyMap(nn.Module):
         matrix = _world_from_pixel(pinhole, world_from_camera)
         if _is_compiled(self.faces):
             mask = np.ones(shape, bool) if needed is None else needed.contiguous().cpu().numpy()
-            picture: Tensor = _Pictured.apply(self.faces, matrix, mask)  # type: ignore[no-untyped-call]
+            picture: Tensor = _Pictured.apply(self.faces, matrix, mask)
             return picture
         colours = _sampled(self.faces, _directions(matrix, shape, self.faces)).reshape(*shape, 3)
         return colours if needed is None else torch.where(needed[..., None], colours, 0.0)
@@ -309,21 +310,30 @@ def _sky_of(frame: Frame) -> Bools:
     return np.zeros(frame.image.shape[:2], bool)
 
 
-def _filled(colours: Float32, known: Bools) -> Float32:
-    """(6, S, S, 3) colours with unknown texels from maps of half the size, in turn."""
-    size = known.shape[1]
-    colours = np.where(known[..., None], colours, np.float32(0.0))
-    if known.all():
+def _filled(colours: Float32, trust: Float32) -> Float32:
+    """(6, S, S, 3) colours, each as far as it is trusted (6, S, S) in 0..1, else from around it.
+
+    Around it is a map of half the size, made of the same, filled in the same way: so a single texel
+    among unknown ones soon loses its say.
+    """
+    size = trust.shape[1]
+    if trust.min() == 1.0:
         return colours
     if size == 1:
-        colours[~known] = colours[known].mean(axis=0) if known.any() else UNKNOWN
-        return colours
+        total = float(trust.sum())
+        weights = trust[..., None] / np.float32(total if total > 0 else 1.0)
+        around = (weights * colours).sum(axis=(0, 1, 2)) if total > 0 else UNKNOWN
+        return (trust[..., None] * colours + (1 - trust[..., None]) * around).astype(np.float32)
     blocks = (6, size // 2, 2, size // 2, 2)
-    counts = known.reshape(blocks).sum(axis=(2, 4))
-    means = colours.reshape(*blocks, 3).sum(axis=(2, 4)) / np.maximum(counts, 1)[..., None]
-    coarse = _filled(means.astype(np.float32), counts > 0)
-    unknown = np.ascontiguousarray(texel_directions(size)[~known])
-    filled = np.empty_like(unknown)
-    sky_kernels.sample(coarse.reshape(-1, 3), table_of(size // 2), unknown, filled)
-    colours[~known] = filled
-    return colours
+    sums = (trust[..., None] * colours).reshape(*blocks, 3).sum(axis=(2, 4))
+    trusts = trust.reshape(blocks).sum(axis=(2, 4))
+    means = sums / np.where(trusts > 0, trusts, np.float32(1.0))[..., None]
+    coarse = _filled(means, trusts / np.float32(4.0))
+    unsure = trust < 1.0
+    directions = np.ascontiguousarray(texel_directions(size)[unsure])
+    around = np.empty_like(directions)
+    sky_kernels.sample(coarse.reshape(-1, 3), table_of(size // 2), directions, around)
+    filled = colours.copy()
+    share = trust[unsure][:, None]
+    filled[unsure] = share * colours[unsure] + (1 - share) * around
+    return filled

@@ -61,7 +61,6 @@ def voxels_of(points: Float64, smallest_m: float, count: int) -> tuple[float, ND
 
     There are at most `count`.
     """
-
     # From a corner, so that in the end a single voxel holds them all.
     corner = points.min(axis=0)
 
@@ -83,7 +82,7 @@ def some_of(total: int, count: int, seed: int) -> NDArray[np.bool_]:
     kept = np.ones(total, np.bool_)
     surplus = total - count
     if surplus > 0:
-        draws = uniforms(key_of("gaussian-cells", seed), total)
+        draws = uniforms(key_of("gs-cells", seed), total)
         kept[np.argsort(draws, kind="stable")[:surplus]] = False
     return kept
 

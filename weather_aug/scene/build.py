@@ -28,6 +28,7 @@ from weather_aug.scene.journal import Round, digest_record, make_all
 from weather_aug.scene.layers import PARTS as LAYER_PARTS
 from weather_aug.scene.layers import encode_layers, layers_seen
 from weather_aug.scene.policy import TYPES
+from weather_aug.scene.reconstruct import FITTING, Wanted, write_reconstruction
 from weather_aug.scene.records import (
     FRAMES,
     SHELTER,
@@ -37,6 +38,7 @@ from weather_aug.scene.records import (
     part_path,
     streets,
 )
+from weather_aug.scene.route import street_axes
 from weather_aug.scene.shelter import View, shelter_of
 
 EDITORS = ("physical",)
@@ -60,15 +62,16 @@ def build(
     *,
     progress: bool,
     overwrite: bool,
+    wanted: Wanted | None = None,
 ) -> None:
     """Write the scene of `clip` to the folder `out`, which appears only when it is complete.
 
     There are two rounds over the frames: the first stores them; the second, when the way driven is
-    known, what the editor sees in each. Work in progress stands in `out` + ".building" with a
-    journal of each round; the same call again continues it, after making the first finished frame
-    once more to see that the clip is still the same. Bad input removes it: there is nothing to
-    continue. A scene that is replaced stands in `out` + ".replaced" until the new one is in its
-    place.
+    known, what the editor sees in each. Where they are wanted, Gaussians follow; see
+    `scene.reconstruct`. Work in progress stands in `out` + ".building" with a journal of each
+    round; the same call again continues it, after making the first finished frame once more to see
+    that the clip is still the same. Bad input removes it: there is nothing to continue. A scene
+    that is replaced stands in `out` + ".replaced" until the new one is in its place.
 
     Args:
         clip: The drive; every frame needs depth.
@@ -78,23 +81,29 @@ def build(
             editor prepares for none, since it edits while rendering; every scene renders them all.
         progress: Show a bar for each round.
         overwrite: Replace `out` if it is a scene already.
+        wanted: What to reconstruct, None for no Gaussians.
 
     Raises:
         ArgumentError: If the editor or a weather is unknown.
         ConflictError: If `out` exists, or another process builds it.
-        ClipError: If the clip is empty or too long, or a frame has no depth.
+        ClipError: If the clip is empty or too long, a frame has no depth, or unrelated pictures
+            are to be reconstructed.
         SceneError: If a name cannot stand in a file name, or a frame cannot be stored.
         OutputError: If the output lies inside another scene, or cannot be written.
     """
     _check_choices(editor, weathers)
     _check_clip(clip)
+    if wanted is not None and not _is_drive(clip):
+        raise ClipError(
+            f"clip {clip.name} is of unrelated pictures; only a drive can be reconstructed"
+        )
     out = _located(out)
     with _held(out):
         _settle_replacement(out)
         _check_free(out, overwrite)
         work = _beside(out, UNFINISHED_SUFFIX)
         try:
-            content = _content(clip, work, editor, weathers, progress)
+            content = _content(clip, work, editor, weathers, progress, wanted)
         except DataError:
             shutil.rmtree(work, ignore_errors=True)
             raise
@@ -103,20 +112,25 @@ def build(
 
 
 def _content(
-    clip: Clip, work: Path, editor: str, weathers: Sequence[str], progress: bool
+    clip: Clip,
+    work: Path,
+    editor: str,
+    weathers: Sequence[str],
+    progress: bool,
+    wanted: Wanted | None,
 ) -> dict[str, Any]:
     """Write all frames into `work`; what the manifest says of them."""
     entries, files = _write_frames(clip, work, progress)
     axes_world = street_axes(entries, clip.up_world)
     shelter = None
     airlight = None
-    is_drive = bool(getattr(clip, "is_drive", True))
+    is_drive = _is_drive(clip)
     if is_drive:
         airlight = np.median([entry["light"]["airlight"] for entry in entries], axis=0).tolist()
         shelter, file = _write_shelter(work, entries, axes_world)
         files |= file
     entries, looks = _write_layers(work, entries, axes_world, is_drive, progress)
-    return {
+    content = {
         "name": clip.name,
         "editor": editor,
         "weathers": list(weathers),
@@ -126,6 +140,18 @@ def _content(
         "frames": entries,
         "files": files | looks,
     }
+    if wanted is None:
+        return content
+    # Scenes without Gaussians have the manifest that they always had.
+    manifest = store.manifest_of(content)
+    entry, gaussians = write_reconstruction(
+        work, manifest, content["files"], wanted, progress=progress
+    )
+    return content | {"reconstruction": entry, "files": content["files"] | gaussians}
+
+
+def _is_drive(clip: Clip) -> bool:
+    return bool(getattr(clip, "is_drive", True))
 
 
 def _write_shelter(
@@ -146,25 +172,6 @@ def _write_shelter(
     record, data = store.encode_shelter(shelter)
     _files.write_whole(work / SHELTER, data)
     return record, {SHELTER: digest_record(data)}
-
-
-def street_axes(entries: Sequence[dict[str, Any]], up_world: Float64) -> Float64:
-    """Axes of the street (3, 3): rows along the first heading, to the left, up.
-
-    The heading is the way the rig went; of a rig that stood, the first camera's view.
-    """
-    up = np.asarray(up_world, np.float64)
-    up = up / np.linalg.norm(up)
-    first = np.array(entries[0]["world_from_camera"])
-    same = [e for e in entries if e["camera"] == entries[0]["camera"]]
-    way = np.array(same[-1]["world_from_camera"])[:3, 3] - first[:3, 3]
-    way -= (way @ up) * up
-    if np.linalg.norm(way) < 1.0:
-        way = first[:3, 2] - (first[:3, 2] @ up) * up
-    if np.linalg.norm(way) < 1e-6:
-        raise ClipError("the first camera looks straight up or down; the street has no heading")
-    along = way / np.linalg.norm(way)
-    return np.stack([along, np.cross(up, along), up])
 
 
 def _check_choices(editor: str, weathers: Sequence[str]) -> None:
@@ -233,6 +240,8 @@ def _publish(work: Path, out: Path) -> None:
     with _files.reported(out):
         for journal in (JOURNAL, LAYERS_JOURNAL):
             (work / journal).unlink(missing_ok=True)
+        if (work / FITTING).exists():
+            shutil.rmtree(work / FITTING)
         try:
             if out.exists():
                 out.rename(replaced)

@@ -31,8 +31,6 @@ class Round:
     """The manifest's entry for a step, and bytes by relative path: always the same."""
     clean: Callable[[Path], None]
     """Make the work folder as it is before the round."""
-    unit: str = "frame"
-    """Of the bar."""
     tries_first: bool = True
     """Make the first finished step once more, to see what the head cannot tell. Not for steps of
     many minutes whose head tells it all."""
@@ -48,7 +46,7 @@ def make_all(task: Round, work: Path, progress: bool) -> dict[str, Record]:
 
     done = _finished(task, work)
     with _files.reported(work), (work / task.journal).open("a", encoding="utf-8") as journal:
-        for key in tqdm(task.keys, desc=task.title, unit=task.unit, disable=not progress):
+        for key in tqdm(task.keys, desc=task.title, unit="frame", disable=not progress):
             if str(key) in done:
                 continue
             record, parts = _made(task, key)

@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -18,7 +19,6 @@ from weather_aug.render.compose import RenderedFrame
 from weather_aug.render.label import kept_labels
 from weather_aug.render.label_snow import buried_borders, covered_faces, snow_limits
 from weather_aug.render.options import RenderOptions
-from weather_aug.scene.policy import TYPES, weather_of
 from weather_aug.scene.viewpoint import Viewpoint, moved
 from weather_aug.taxonomy import IGNORE
 from weather_aug.weather import Weather
@@ -27,12 +27,8 @@ Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Poses = Mapping[int, ArrayLike]
 
-CARRIED = (*("relight", "sky", "film", "mirror", "puddles", "ripples", "snow_cover", "tracks"),)
-"""Effects on surfaces: a style of the Gaussians has them already."""
 PLANES = ("image", "depth", "label", "seen", "normals")
 """Of a novel frame; only the last can be done without."""
-STYLE_SEVERITY = "heavy"
-"""Of the weather that styles are fitted to; `amount` goes from none of it to all."""
 AT_ITS_TIME_S = 1e-3
 """A frame so near in time is the recorded moment."""
 
@@ -41,35 +37,15 @@ class NovelFrame(NamedTuple):
     """A frame drawn from Gaussians."""
 
     frame: Frame
-    """Its label is 255 where the drive never showed what is there."""
     seen: Mask
     """(H, W): recorded frames showed what is there."""
 
-
-def style_weather(name: str) -> Weather | None:
-    """What lies on the ground and covers the sky in a style: its weather, with nothing in the air.
-
-    None for a style whose name is no type of weather.
-    """
-    if name not in TYPES:
-        return None
-    weather = weather_of(name, STYLE_SEVERITY, falling=False)
-    air = Weather.clear()
-    in_the_air = ("visibility_m", "fog_scale_height_m", "mist_per_km", "spray_per_km", "lamps")
-    return replace(weather, **{field: getattr(air, field) for field in in_the_air})
-
-
-def lying_in(style: str | Weights | None, amount: float) -> Weather:
-    """The snow on the ground of a style, or of a mixture of styles; all else is clear."""
-    if style is None:
-        return Weather.clear()
-    weights = {style: 1.0} if isinstance(style, str) else style
-    known = [(share, style_weather(name)) for name, share in weights.items()]
-    snow = {
-        name: sum(amount * share * getattr(weather, name) for share, weather in known if weather)
-        for name in ("snow_cover", "road_snow_cover", "snow_depth_m")
-    }
-    return replace(Weather.clear(), **snow)
+    def masked(self) -> NovelFrame:
+        """The same with the label 255 where nothing recorded tells what is there."""
+        if self.frame.label is None:
+            return self
+        label = np.where(self.seen, self.frame.label, np.uint8(IGNORE))
+        return self._replace(frame=replace(self.frame, label=label))
 
 
 def novel_camera(
@@ -91,7 +67,7 @@ def novel_frame(
     poses: Poses | None = None,
     want: Collection[str] = PLANES,
 ) -> NovelFrame:
-    """What `camera` would have taken at `time_s`.
+    """What `camera` would have taken at `time_s`, with the most likely label everywhere.
 
     Args:
         reconstruction: The drive.
@@ -120,13 +96,28 @@ def novel_frame(
         want=want,
     )
     seen = np.ones(shown.opacity.shape, bool) if shown.seen is None else shown.seen
-    label = None if shown.label is None else np.where(seen, shown.label, np.uint8(IGNORE))
     boxes = boxes_at(reconstruction.actors, recorded, time_s, without, poses or {})
     assert shown.image is not None
+    label = None if shown.label is None else _guessed(shown.label, seen)
     frame = Frame(
-        key, time_s, camera, shown.image, label, _stored_depth(shown), shown.normals_world, boxes
+        *(key, time_s, camera, shown.image, label),
+        *(_stored_depth(shown), shown.normals_world, boxes),
     )
     return NovelFrame(frame, seen)
+
+
+def _guessed(label: NDArray[np.uint8], seen: Mask) -> NDArray[np.uint8]:
+    """The label with the nearest pixel's class where nothing was seen and no class is known."""
+    known = label != IGNORE
+    blank = ~known & ~seen
+    if not blank.any() or not known.any():
+        return label
+    _, nearest = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    class_by_seed = np.zeros(int(nearest.max()) + 1, np.uint8)
+    class_by_seed[nearest[known]] = label[known]
+    return np.where(blank, class_by_seed[nearest], label)
 
 
 def _stored_depth(shown: View) -> NDArray[np.float16]:
@@ -186,11 +177,6 @@ def _velocity_of(actor: Actor, recorded: Frame, time_s: float) -> Float64 | None
     return velocity if np.linalg.norm(velocity) <= MAX_SPEED_M_PER_S else None
 
 
-def carried_options(options: RenderOptions) -> RenderOptions:
-    """Without what a style's colours show already: the editor would dress the street twice."""
-    return replace(options, without=(*options.without, *CARRIED))
-
-
 def honest(
     shot: RenderedFrame, novel: NovelFrame, lying: Weather, options: RenderOptions
 ) -> RenderedFrame:
@@ -198,19 +184,24 @@ def honest(
 
     Args:
         shot: In the weather, by `carried_options` if the frame shows a style.
-        novel: What was rendered.
+        novel: What was rendered: dressed by the most likely labels, so that no seam shows where
+            the recorded frames end.
         lying: What lies on the ground in the frame's style; see `lying_in`.
         options: As they were asked for, not `carried_options`.
     """
     top, left, height, width = shot.window
-    seen = novel.seen[top : top + height, left : left + width]
-    label, invalid = shot.label, shot.invalid | ~seen
+    unseen = ~novel.seen[top : top + height, left : left + width]
+    label, full = shot.label, shot.label_full
+    invalid = shot.invalid | unseen
     limits = snow_limits(lying, options)
     if limits is not None and label is not None:
         buried = buried_borders(novel.frame, shot.window, limits)
         label = kept_labels(label, buried, options.labels)
         invalid |= buried | covered_faces(novel.frame, shot.window, limits)
-    return replace(shot, label=label, invalid=invalid)
+    if label is not None and full is not None:
+        label, full = (np.where(unseen, np.uint8(IGNORE), plane) for plane in (label, full))
+    frame = novel.masked().frame
+    return replace(shot, label=label, label_full=full, invalid=invalid, frame=frame)
 
 
 def warm_up() -> None:

@@ -10,16 +10,16 @@
     gaussians/exposures.npy             (E, 3, 4) float32
     gaussians/style.NAME.sh.npy …       float16 colours in one weather
 
-What has names (actors, cameras, styles) and the shape of each array stand in the manifest. Arrays
-are read memory-mapped; every number of them is checked then, because kernels check none.
+What has names (actors, cameras, styles) and the shape of each array stand in the manifest, see
+`reconstruction_record`. Arrays are read memory-mapped; every number of them is checked then,
+because kernels check none.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,96 +36,27 @@ from weather_aug.gaussians.types import (
     Style,
 )
 from weather_aug.scene.arrays import mapped, npy_bytes
-from weather_aug.scene.boxes import MAX_CLASS_NAME
-from weather_aug.scene.records import LARGEST, StoredFile, check_name, check_scale
+from weather_aug.scene.reconstruction_record import (
+    GAUSSIANS,
+    SCORES,
+    SETS,
+    STYLE_KINDS,
+    Kind,
+    ReconstructionRecord,
+    array_path,
+    kind_of,
+    kinds_of,
+    style_array,
+)
+from weather_aug.scene.records import check_name, check_scale
 
-GAUSSIANS = "gaussians"
-MOST_LOG_SCALE = 40.0
-"""exp of it and its square are numbers in single precision."""
-MOST_LOGIT = 1000.0
-MOST_COLOUR = 1000.0
-MOST_HALF = 65504.0
 LEAST_QUATERNION = 1e-6
 """Shorter ones have no direction in single precision."""
+
 
 Arrays = dict[str, NDArray[Any]]
 Parts = dict[str, bytes]
 Entry = dict[str, Any]
-
-
-class _Kind(NamedTuple):
-    """How an array is stored, and the greatest number in it."""
-
-    dtype: str
-    dimensions: int
-    largest: float
-
-
-_SETS = {
-    "means_m": _Kind("<f4", 2, LARGEST),
-    "quaternions": _Kind("<f4", 2, LARGEST),
-    "log_scales": _Kind("<f4", 2, MOST_LOG_SCALE),
-    "logit_opacities": _Kind("<f4", 1, MOST_LOGIT),
-    "sh": _Kind("<f4", 3, MOST_COLOUR),
-    "class_scores": _Kind("<f2", 2, MOST_HALF),
-}
-_KINDS = {
-    f"{which}_{name}": kind for which in ("background", "actor") for name, kind in _SETS.items()
-}
-_SCORES = ("background_class_scores", "actor_class_scores")
-_OPTIONAL = (*_SCORES, "support")
-"""What is found out when the geometry is known."""
-_KINDS |= {
-    "owners": _Kind("<i4", 1, 2**31 - 1),
-    "offsets_m": _Kind("<f4", 3, LARGEST),
-    "sky_faces": _Kind("<f4", 4, MOST_COLOUR),
-    "sky_seen": _Kind("|u1", 3, 1),
-    "support": _Kind("<f4", 1, 3e38),
-    "track_times_s": _Kind("<f8", 1, LARGEST),
-    "track_poses": _Kind("<f8", 3, LARGEST),
-    "camera_intrinsics": _Kind("<f8", 3, LARGEST),
-    "camera_poses": _Kind("<f8", 3, LARGEST),
-    "camera_motions": _Kind("<f8", 3, LARGEST),
-    "camera_numbers": _Kind("<f8", 2, LARGEST),
-    "exposures": _Kind("<f4", 3, MOST_COLOUR),
-}
-_STYLE_KINDS = {
-    "sh": _Kind("<f2", 3, MOST_COLOUR),
-    "actor_sh": _Kind("<f2", 3, MOST_COLOUR),
-    "sky": _Kind("<f2", 4, MOST_COLOUR),
-}
-
-
-@dataclass(frozen=True)
-class ActorRecord:
-    """What the manifest says of a tracked object."""
-
-    track_id: int
-    class_name: str
-    is_deformable: bool
-    size_m: tuple[float, float, float]
-    moments: int
-    """How many of the tracks' poses are its own."""
-
-
-@dataclass(frozen=True, eq=False)
-class ReconstructionRecord:
-    """What the manifest says of the Gaussians."""
-
-    shapes: Mapping[str, tuple[int, ...]]
-    """By name of the array."""
-    actors: tuple[ActorRecord, ...]
-    cameras: tuple[FrameKey, ...]
-    """Frames with a refined camera, in the order of their arrays."""
-    exposures: tuple[FrameKey, ...]
-    styles: tuple[str, ...]
-    fit: Mapping[str, float]
-    """How well the frames were met: PSNR in dB, SSIM, …"""
-
-
-def array_path(name: str) -> str:
-    """Relative path of an array."""
-    return f"{GAUSSIANS}/{name}.npy"
 
 
 def encode_geometry(reconstruction: Reconstruction) -> tuple[Entry, Parts]:
@@ -162,7 +93,7 @@ def encode_geometry(reconstruction: Reconstruction) -> tuple[Entry, Parts]:
 def encode_labels(reconstruction: Reconstruction) -> tuple[Entry, Parts]:
     """Class scores and support, as `encode_geometry` gives the rest; only those that there are."""
     scores = (reconstruction.background.class_scores, reconstruction.actor_gaussians.class_scores)
-    arrays: Arrays = dict(zip(_SCORES, scores, strict=True)) if scores[0].shape[1] else {}
+    arrays: Arrays = dict(zip(SCORES, scores, strict=True)) if scores[0].shape[1] else {}
     if len(reconstruction.support):
         arrays["support"] = reconstruction.support
     return _encoded(arrays)
@@ -171,9 +102,7 @@ def encode_labels(reconstruction: Reconstruction) -> tuple[Entry, Parts]:
 def encode_style(name: str, style: Style) -> tuple[Entry, Parts]:
     """The colours of a weather, as `encode_geometry` gives the rest."""
     check_name("style", name)
-    entry, parts = _encoded(
-        {_style_array(name, part): getattr(style, part) for part in _STYLE_KINDS}
-    )
+    entry, parts = _encoded({style_array(name, part): getattr(style, part) for part in STYLE_KINDS})
     return entry | {"styles": [name]}, parts
 
 
@@ -187,35 +116,6 @@ def joined(entries: Iterable[Entry]) -> Entry:
     return whole
 
 
-def parse_reconstruction(
-    entry: Any, files: Mapping[str, StoredFile]
-) -> ReconstructionRecord | None:
-    """A record from the manifest's entry, None of None; whatever is malformed raises."""
-    if entry is None:
-        return None
-    styles = tuple(check_name("style", name) for name in entry["styles"])
-    if len(set(styles)) < len(styles):
-        raise ValueError("a style stands twice")
-    kinds = _kinds(styles)
-    shapes = {str(name): tuple(_count(n) for n in shape) for name, shape in entry["arrays"].items()}
-    optional = set(_OPTIONAL)
-    if not set(kinds) - optional <= set(shapes) <= set(kinds):
-        odd = min((set(kinds) - optional - set(shapes)) | (set(shapes) - set(kinds)))
-        raise ValueError(f"the Gaussians' array {printable(odd)} is missing, or none is so called")
-    for name, shape in shapes.items():
-        if len(shape) != kinds[name].dimensions or array_path(name) not in files:
-            raise ValueError(f"the Gaussians' array {name} has no file, or another shape")
-    fit = {check_name("number", name): float(value) for name, value in entry["fit"].items()}
-    return ReconstructionRecord(
-        shapes,
-        tuple(_parse_actor(actor) for actor in entry["actors"]),
-        _parse_keys(entry["cameras"]),
-        _parse_keys(entry["exposures"]),
-        styles,
-        fit,
-    )
-
-
 def read_reconstruction(folder: Path, record: ReconstructionRecord) -> Reconstruction:
     """The Gaussians of a scene folder, memory-mapped.
 
@@ -223,7 +123,7 @@ def read_reconstruction(folder: Path, record: ReconstructionRecord) -> Reconstru
         SceneError: If a file cannot be read, or holds another type, shape or range, or the arrays
             do not fit together.
     """
-    kinds = _kinds(record.styles)
+    kinds = kinds_of(record.styles)
     arrays: Arrays = {}
     for name, shape in record.shapes.items():
         path = folder / array_path(name)
@@ -240,23 +140,12 @@ def _wrong(folder: Path, what: str) -> SceneError:
     return SceneError(f"{printable(folder / GAUSSIANS, 200)}: {what}; build the scene again")
 
 
-def _style_array(style: str, part: str) -> str:
-    return f"style.{style}.{part}"
-
-
-def _kinds(styles: Iterable[str]) -> dict[str, _Kind]:
-    """All arrays that a reconstruction with these styles may have."""
-    return _KINDS | {
-        _style_array(style, part): kind for style in styles for part, kind in _STYLE_KINDS.items()
-    }
-
-
 def _arrays_of(scene: Reconstruction) -> Arrays:
     sets = {"background": scene.background, "actor": scene.actor_gaussians}
     arrays: Arrays = {
         f"{which}_{name}": getattr(gaussians, name)
         for which, gaussians in sets.items()
-        for name in _SETS
+        for name in SETS
         if name != "class_scores"
     }
     cameras, actors = list(scene.cameras.values()), scene.actors
@@ -286,7 +175,7 @@ def _stacked(values: Sequence[Any], shape: tuple[int, ...]) -> NDArray[np.float6
 def _encoded(arrays: Arrays) -> tuple[Entry, Parts]:
     shapes, parts = {}, {}
     for name, array in arrays.items():
-        kind = _kind_of(name)
+        kind = kind_of(name)
         with np.errstate(over="ignore"):
             stored = np.asarray(array).astype(kind.dtype)
         if stored.ndim != kind.dimensions or not _in_range(stored, kind):
@@ -299,45 +188,11 @@ def _encoded(arrays: Arrays) -> tuple[Entry, Parts]:
     return {"arrays": shapes}, parts
 
 
-def _kind_of(name: str) -> _Kind:
-    # No style's name has a dot.
-    return _KINDS[name] if name in _KINDS else _STYLE_KINDS[name.rsplit(".", 1)[1]]
-
-
-def _in_range(array: NDArray[Any], kind: _Kind) -> bool:
+def _in_range(array: NDArray[Any], kind: Kind) -> bool:
     """Whether all are numbers in range; least and most of NaN are NaN, which is in none."""
     if array.size == 0:
         return True
     return bool(array.min() >= -kind.largest and array.max() <= kind.largest)
-
-
-def _count(value: Any) -> int:
-    if isinstance(value, bool) or value != int(value) or value < 0:
-        raise ValueError("a shape must be of whole numbers")
-    return int(value)
-
-
-def _parse_actor(entry: Any) -> ActorRecord:
-    name, track = entry["class_name"], entry["track_id"]
-    if not isinstance(name, str) or not name.isprintable() or not 0 < len(name) <= MAX_CLASS_NAME:
-        raise ValueError(f"class name must be 1 to {MAX_CLASS_NAME} printable characters")
-    if isinstance(track, bool) or not -(2**63) <= track.__index__() < 2**64:
-        raise ValueError("track id must be an integer in [-2**63, 2**64)")
-    if not isinstance(entry["is_deformable"], bool):
-        raise ValueError("is_deformable must be true or false")
-    length, width, height = (float(side) for side in entry["size_m"])
-    if not 0 < min(length, width, height) <= max(length, width, height) <= LARGEST:
-        raise ValueError("an actor's size is out of its range")
-    moments = _count(entry["moments"])
-    size_m = (length, width, height)
-    return ActorRecord(int(track), name, entry["is_deformable"], size_m, moments)
-
-
-def _parse_keys(entries: Any) -> tuple[FrameKey, ...]:
-    keys = tuple(FrameKey(int(index), check_name("camera", camera)) for index, camera in entries)
-    if len(set(keys)) < len(keys):
-        raise ValueError("a frame stands twice")
-    return keys
 
 
 def _assembled(arrays: Arrays, record: ReconstructionRecord) -> Reconstruction:
@@ -394,7 +249,7 @@ def _check_shapes(arrays: Arrays, expected: dict[str, tuple[int, ...]]) -> None:
 
 def _gaussians(arrays: Arrays, which: str) -> Gaussians:
     count = len(arrays[f"{which}_means_m"])
-    fields = {name: arrays.get(f"{which}_{name}") for name in _SETS}
+    fields: dict[str, Any] = {name: arrays.get(f"{which}_{name}") for name in SETS}
     scores = fields["class_scores"]
     if scores is None:
         fields["class_scores"] = np.zeros((count, 0), np.float16)
@@ -450,10 +305,13 @@ def _cameras(arrays: Arrays, record: ReconstructionRecord) -> dict[FrameKey, Cam
 
 
 def _style(arrays: Arrays, name: str, count: int, moving: int, side: int) -> Style:
-    style = Style(**{part: arrays[_style_array(name, part)] for part in _STYLE_KINDS})
-    shapes = {"sh": (count, style.sh.shape[1], 3), "actor_sh": (moving, style.actor_sh.shape[1], 3)}
-    shapes |= {"sky": (6, side, side, 3)}
-    _check_shapes(arrays, {_style_array(name, part): shape for part, shape in shapes.items()})
+    style = Style(**{part: arrays[style_array(name, part)] for part in STYLE_KINDS})
+    shapes: dict[str, tuple[int, ...]] = {
+        "sh": (count, style.sh.shape[1], 3),
+        "actor_sh": (moving, style.actor_sh.shape[1], 3),
+        "sky": (6, side, side, 3),
+    }
+    _check_shapes(arrays, {style_array(name, part): shape for part, shape in shapes.items()})
     if not {style.sh.shape[1], style.actor_sh.shape[1]} <= set(SH_COEFFICIENTS):
         raise ValueError(f"style {name} must hold {SH_COEFFICIENTS} coefficients a Gaussian")
     return style

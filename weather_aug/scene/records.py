@@ -12,15 +12,17 @@ from numpy.typing import NDArray
 
 from weather_aug._checks import MAX_PIXELS
 from weather_aug.clip.types import RIGID_TOLERANCE, Camera, FrameKey
-from weather_aug.edit.ambience import CAMERA_HEIGHT_M, CAMERA_HEIGHT_RANGE_M
+from weather_aug.edit.ambience import CAMERA_HEIGHT_M, CAMERA_HEIGHT_RANGE_M, Ambience
 from weather_aug.errors import SceneError, printable
 from weather_aug.particles.shelter import CELL_M
+from weather_aug.render.fields import RigMotion
 from weather_aug.scene.layers import PARTS as LAYER_PARTS
 from weather_aug.scene.layers import LayersRecord, Street, parse_layers
 from weather_aug.scene.route import route_of
+from weather_aug.scene.viewpoint import raised_height_m
 
 if TYPE_CHECKING:
-    from weather_aug.scene.reconstruction import ReconstructionRecord
+    from weather_aug.scene.reconstruction_record import ReconstructionRecord
 
 FRAMES = "frames"
 SHELTER = "shelter.npy"
@@ -96,6 +98,14 @@ class Manifest:
         """Height of a camera over the road, metres: the median of its frames."""
         return self._height_by_camera_m[camera]
 
+    def ambience(self, record: FrameRecord, raised_m: float = 0.0) -> Ambience:
+        """Light around a frame whose camera stands `raised_m` higher than it was recorded."""
+        light = dict(record.light)
+        if self.airlight is not None:
+            light["airlight"] = self.airlight
+        height_m = raised_height_m(self.camera_height_m(record.key.camera), raised_m)
+        return Ambience(self.axes_world, **light, camera_height_m=height_m)
+
 
 def _heights_m(frames: Iterable[FrameRecord]) -> dict[str, float]:
     heights: dict[str, list[float]] = {}
@@ -124,6 +134,15 @@ def streets(
         route = route_of(np.array([np.mean(places[time], axis=0) for time in sorted(places)]))
     heights_m = _heights_m(frames)
     return {camera: Street(axes_world, height_m, route) for camera, height_m in heights_m.items()}
+
+
+def rig_motion(frames: Sequence[FrameRecord], key: FrameKey) -> RigMotion:
+    """Of a clip's first camera up to the moment of a frame, or to the last one before it."""
+    first = frames[0]
+    seen = [record for record in frames if record.key.camera == first.key.camera]
+    before = [record for record in seen if record.key.time_index <= key.time_index]
+    now = before[-1] if before else seen[0]
+    return RigMotion(first.camera.world_from_camera, now.camera.world_from_camera)
 
 
 def check_name(what: str, name: Any) -> str:

@@ -1,10 +1,15 @@
-"""The way that a camera was driven, from the places of its frames: smooth, and of few points."""
+"""The way that was driven: its axes, and a camera's own, smooth and of few points."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from weather_aug.errors import ClipError
 
 Float64 = NDArray[np.float64]
 
@@ -20,6 +25,25 @@ TOLERANCE_M = 0.02
 """A knot that is no farther from the line between its neighbours is left out."""
 REACH_M = 80.0
 """Tracks of wheels are narrower than a pixel farther away."""
+
+
+def street_axes(entries: Sequence[dict[str, Any]], up_world: Float64) -> Float64:
+    """Axes of the street (3, 3): rows along the first heading, to the left, up.
+
+    The heading is the way the rig went; of a rig that stood, the first camera's view.
+    """
+    up = np.asarray(up_world, np.float64)
+    up = up / np.linalg.norm(up)
+    first = np.array(entries[0]["world_from_camera"])
+    same = [e for e in entries if e["camera"] == entries[0]["camera"]]
+    way = np.array(same[-1]["world_from_camera"])[:3, 3] - first[:3, 3]
+    way -= (way @ up) * up
+    if np.linalg.norm(way) < 1.0:
+        way = first[:3, 2] - (first[:3, 2] @ up) * up
+    if np.linalg.norm(way) < 1e-6:
+        raise ClipError("the first camera looks straight up or down; the street has no heading")
+    along = way / np.linalg.norm(way)
+    return np.stack([along, np.cross(up, along), up])
 
 
 def route_of(places: Float64) -> Float64 | None:

@@ -16,18 +16,19 @@ from weather_aug.errors import ArgumentError, IntegrityError, printable
 from weather_aug.gaussians.types import Reconstruction
 from weather_aug.particles.shelter import Shelter
 from weather_aug.render.compose import RenderedFrame, render
-from weather_aug.render.fields import RigMotion
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene import store
 from weather_aug.scene.layers import Street, layers_seen
 from weather_aug.scene.reconstruction import read_reconstruction
-from weather_aug.scene.records import FrameRecord, Manifest, streets
+from weather_aug.scene.records import FrameRecord, Manifest, rig_motion, streets
+from weather_aug.scene.styles import carried_options, lying_in
 from weather_aug.scene.viewpoint import Viewpoint, raised_height_m
 from weather_aug.timeline import WeatherTimeline
 from weather_aug.weather import Weather
 
 if TYPE_CHECKING:
     from weather_aug.air import Air
+    from weather_aug.gaussians.fit import FitOptions
     from weather_aug.gaussians.gather import Weights
     from weather_aug.scene.novel import NovelFrame, Poses
 
@@ -77,11 +78,44 @@ class WeatherScene:
         weathers: Sequence[str] = ("rain", "snow", "fog"),
         progress: bool = False,
         overwrite: bool = False,
+        reconstruct: bool = False,
+        reconstruction: FitOptions | None = None,
+        styles: Sequence[str] = ("rain", "snow", "fog"),
     ) -> WeatherScene:
-        """Precompute `clip` into the folder `out`; see `weather_aug.scene.build.build`."""
+        """Precompute `clip` into the folder `out`; see `weather_aug.scene.build.build`.
+
+        Args:
+            clip: The drive; every frame needs depth.
+            out: Folder to make.
+            editor: How backgrounds get their weather.
+            weathers: Types the scene is meant for.
+            progress: Show bars.
+            overwrite: Replace `out` if it is a scene already.
+            reconstruct: Turn the frames into Gaussians as well, so that they can be rendered from
+                elsewhere; takes minutes. Interrupted work goes on from its last checkpoint.
+            reconstruction: How; the default options if None.
+            styles: Weathers whose colours the Gaussians learn, as the editor shows them at the
+                heavy stop with nothing in the air.
+
+        Raises:
+            ArgumentError: If options of a reconstruction are given without `reconstruct`, or as
+                `build` and `scene.reconstruct.wanted_of` say.
+        """
         from weather_aug.scene.build import build
 
-        build(clip, Path(out), editor, weathers, progress=progress, overwrite=overwrite)
+        if reconstruction is not None and not reconstruct:
+            raise ArgumentError("reconstruction means nothing without reconstruct=True")
+        wanted = None
+        if reconstruct:
+            from weather_aug.scene.reconstruct import wanted_of
+
+            wanted = wanted_of(reconstruction, styles)
+        build(
+            *(clip, Path(out), editor, weathers),
+            progress=progress,
+            overwrite=overwrite,
+            wanted=wanted,
+        )
         return cls.load(out)
 
     @cached_property
@@ -124,15 +158,7 @@ class WeatherScene:
         The airlight is the clip's too if it is a drive: fog does not flicker. Of unrelated pictures
         each has its own.
         """
-        return self._ambience(key, 0.0)
-
-    def _ambience(self, key: FrameKey, raised_m: float) -> Ambience:
-        key = FrameKey(*key)
-        light = dict(self._record(key).light)
-        if self.manifest.airlight is not None:
-            light["airlight"] = self.manifest.airlight
-        height_m = raised_height_m(self.manifest.camera_height_m(key.camera), raised_m)
-        return Ambience(self.manifest.axes_world, **light, camera_height_m=height_m)
+        return self.manifest.ambience(self._record(key))
 
     @cached_property
     def shelter(self) -> Shelter | None:
@@ -204,7 +230,7 @@ class WeatherScene:
         never recorded, drawn from the scene's Gaussians (see `frame_from`): what no recorded frame
         showed has the label 255, and is invalid. There are two ways to its background. Without a
         style the editor dresses the picture, as it does recorded ones. A style shows its weather
-        already: the effects on surfaces (`scene.novel.CARRIED`) are left out, whatever the weather
+        already: the effects on surfaces (`scene.styles.CARRIED`) are left out, whatever the weather
         says of the ground; air, particles, light on them, spray, lamps, glass and sensor follow the
         weather, and labels are buried under the style's snow.
 
@@ -232,17 +258,10 @@ class WeatherScene:
             look = self._layers_of
             return self._rendered(self.frame(key), look, weather, seed, window, air, options)
         # Loads torch.
-        from weather_aug.scene.novel import carried_options, honest, lying_in
+        from weather_aug.scene.novel import honest
 
-        novel = self.frame_from(
-            key,
-            viewpoint,
-            style=style,
-            amount=amount,
-            without=without_actors,
-            poses=poses,
-            normals=False,
-        )
+        shown = dict(style=style, amount=amount, without=without_actors, poses=poses)
+        novel = self._novel(key, viewpoint, None, None, normals=False, **shown)
         dressing = options if style is None else carried_options(options)
         look = self._looked_at
         shot = self._rendered(novel.frame, look, weather, seed, window, air, dressing)
@@ -269,11 +288,11 @@ class WeatherScene:
             frame,
             weather,
             seed=seed,
-            ambience=self._ambience(frame.key, self._raised_m(frame)),
+            ambience=self.manifest.ambience(self._record(frame.key), self._raised_m(frame)),
             window=window,
             air=air,
             shelter=self.shelter,
-            rig=self._rig_motion(frame.key) if options.needs_rig else None,
+            rig=rig_motion(self.manifest.frames, frame.key) if options.needs_rig else None,
             layers=look(frame) if is_seen else None,
             options=options,
         )
@@ -314,32 +333,32 @@ class WeatherScene:
                 are given, or a style or a track is unknown.
             SceneError: If a file of the scene cannot be read any more.
         """
+        if camera is not None and viewpoint is not None:
+            raise ArgumentError("give a viewpoint or a camera, not both")
+        shown = dict(style=style, amount=amount, without=without, poses=poses)
+        return self._novel(key, viewpoint, camera, time_s, normals=normals, **shown).masked()
+
+    def _novel(
+        self,
+        key: FrameKey,
+        viewpoint: Viewpoint | None,
+        camera: Camera | None,
+        time_s: float | None,
+        *,
+        normals: bool,
+        **shown: Any,
+    ) -> NovelFrame:
+        """`frame_from` with the most likely label where nothing was seen."""
         from weather_aug.scene.novel import PLANES, novel_camera, novel_frame
 
         reconstruction = self._gaussians()
-        record = self._record(key)
-        if camera is not None and viewpoint is not None:
-            raise ArgumentError("give a viewpoint or a camera, not both")
-        if viewpoint is not None and not isinstance(viewpoint, Viewpoint):
-            raise ArgumentError(
-                f"viewpoint must be a Viewpoint, got {type(viewpoint).__name__}; write "
-                "Viewpoint(lateral_m=1.0)"
-            )
-        recorded = store.read_frame(self.path, record)
+        recorded = store.read_frame(self.path, self._record(key))
         if camera is None:
             axes_world = self.manifest.axes_world
             camera = novel_camera(reconstruction, recorded, axes_world, viewpoint or Viewpoint())
-        return novel_frame(
-            reconstruction,
-            recorded,
-            camera,
-            recorded.time_s if time_s is None else finite("time_s", time_s),
-            style=style,
-            amount=amount,
-            without=without,
-            poses=poses,
-            want=PLANES if normals else PLANES[:-1],
-        )
+        time_s = recorded.time_s if time_s is None else finite("time_s", time_s)
+        want = PLANES if normals else PLANES[:-1]
+        return novel_frame(reconstruction, recorded, camera, time_s, want=want, **shown)
 
     def _gaussians(self) -> Reconstruction:
         if self.reconstruction is None:
@@ -353,14 +372,6 @@ class WeatherScene:
         """How much higher a frame's camera stands than the recorded one."""
         here, there = frame.camera, self._record(frame.key).camera
         return float(self.manifest.axes_world[2] @ (here.centre_world - there.centre_world))
-
-    def _rig_motion(self, key: FrameKey) -> RigMotion:
-        """Of the clip's first camera up to the moment of a frame, or to the last one before it."""
-        first = self.manifest.frames[0]
-        seen = [r for r in self.manifest.frames if r.key.camera == first.key.camera]
-        before = [r for r in seen if r.key.time_index <= key.time_index]
-        now = before[-1] if before else seen[0]
-        return RigMotion(first.camera.world_from_camera, now.camera.world_from_camera)
 
     def damaged_files(self) -> list[str]:
         """Compare every file with its digest; one sentence for each that has changed."""

@@ -19,6 +19,7 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ from weather_aug.scene.arrays import mapped, npy_bytes
 from weather_aug.scene.boxes import encode_boxes, read_boxes
 from weather_aug.scene.layers import PARTS as LAYER_PARTS
 from weather_aug.scene.layers import read_layers as stored_layers
-from weather_aug.scene.reconstruction import parse_reconstruction
+from weather_aug.scene.reconstruction_record import parse_reconstruction
 from weather_aug.scene.records import (
     LIGHTS,
     SHELTER,
@@ -298,27 +299,32 @@ def _parse(content: Any, path: Path) -> Manifest:
             f"{printable(path, 200)} has version {printable(content['version'])}, this program "
             f"reads version {VERSION}; update weather_aug or build the scene again"
         )
-    files = {
-        str(relative): StoredFile(int(entry["size"]), str(entry["sha256"]))
-        for relative, entry in content["files"].items()
-    }
-    frames = tuple(parse_frame(entry) for entry in content["frames"])
+    manifest = manifest_of(content)
+    frames, files = manifest.frames, manifest.files
     if not frames or len({record.key for record in frames}) < len(frames):
         raise SceneError(f"{printable(path, 200)} has no frames, or one twice; build it again")
     for record in frames:
         unlisted = sorted(set(record.files.values()) - set(files))
         if unlisted:
             raise SceneError(f"{printable(path, 200)}: {printable(unlisted[0])} has no digest")
+    return replace(manifest, digest=_files.sha256_of_file(path))
+
+
+def manifest_of(content: Mapping[str, Any]) -> Manifest:
+    """The manifest of these JSON values; whatever is malformed raises."""
+    files = {
+        str(relative): StoredFile(int(entry["size"]), str(entry["sha256"]))
+        for relative, entry in content["files"].items()
+    }
     return Manifest(
         name=check_name("name", content["name"]),
         editor=check_name("editor", content["editor"]),
         weathers=tuple(check_name("weather", name) for name in content["weathers"]),
         axes_world=axes_of(content["axes_world"]),
         airlight=None if content["airlight"] is None else light_of(content["airlight"]),
-        frames=frames,
+        frames=tuple(parse_frame(entry) for entry in content["frames"]),
         files=files,
         shelter=parse_shelter(content.get("shelter"), files),
         # Scenes of before there were any, or built without, have none.
         reconstruction=parse_reconstruction(content.get("reconstruction"), files),
-        digest=_files.sha256_of_file(path),
     )

@@ -128,8 +128,14 @@ def moved(camera: Camera, axes_world: Float64, viewpoint: Viewpoint) -> Camera:
         the recorded camera's velocity and what the turning adds at its distance.
 
     Raises:
+        ArgumentError: If the viewpoint is none.
         CalibrationError: If it would move faster than any car does.
     """
+    if not isinstance(viewpoint, Viewpoint):
+        raise ArgumentError(
+            f"viewpoint must be a Viewpoint, got {type(viewpoint).__name__}; write "
+            "Viewpoint(lateral_m=1.0)"
+        )
     if viewpoint == Viewpoint():
         return camera
     up = axes_world[2] / np.linalg.norm(axes_world[2])

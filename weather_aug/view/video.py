@@ -57,6 +57,7 @@ def drive_frames(
     *,
     seed: int = 0,
     options: RenderOptions = DEFAULT_OPTIONS,
+    **elsewhere: Any,
 ) -> Iterator[UInt8]:
     """Every recorded frame of a camera in weather, in the order of time.
 
@@ -66,6 +67,8 @@ def drive_frames(
         weather: State of air and ground, or how it changes with the time since the first frame.
         seed: Which particles fall and which gusts blow.
         options: Choices besides the weather.
+        **elsewhere: `viewpoint`, `style`, `amount` and `without_actors`, as of
+            `WeatherScene.render`.
 
     Returns:
         (H, W, 3) sRGB pictures, rendered as they are asked for.
@@ -74,7 +77,8 @@ def drive_frames(
         ArgumentError: If the scene has no such camera.
     """
     keys = keys_of(scene, camera)
-    return (scene.render(key, weather, seed=seed, options=options).image for key in keys)
+    choices = {"seed": seed, "options": options, **elsewhere}
+    return (scene.render(key, weather, **choices).image for key in keys)
 
 
 def parked_frames(

@@ -223,7 +223,9 @@ def test_the_road_moves_along_with_a_refined_camera() -> None:
     found = seen_in_road(scene, site)
     expected = mirrored(scene, recorded, ROAD_PLANE, 0.0, key=key)
     np.testing.assert_allclose(expected.opacity, found.opacity, atol=1e-4)
+    as_novel = seen_in_road(scene, site, novel=True)
     unmoved = mirrored(scene, small_camera(site), Plane(point, normal), 0.0)
+    np.testing.assert_array_equal(unmoved.opacity, as_novel.opacity)
     assert np.abs(unmoved.opacity - expected.opacity).max() > 0.1
 
 

@@ -162,15 +162,21 @@ def mirrored(
     return Seen(*(np.ascontiguousarray(a) for a in (np.clip(srgb, 0, 1), depth, opacity)))
 
 
-def seen_in_road(reconstruction: Reconstruction, site: Site, *, threads: int = 1) -> Seen:
-    """The mirror image that `edit.physical.layers.layers_of` takes for a recorded frame.
+def seen_in_road(
+    reconstruction: Reconstruction, site: Site, *, novel: bool = False, threads: int = 1
+) -> Seen:
+    """The mirror image that `edit.physical.layers.layers_of` takes for a frame.
 
-    The road lies under the camera as in the frame's own depth; where the reconstruction has refined
-    the camera, the road moves along with it.
+    Args:
+        reconstruction: The drive.
+        site: The frame. The road lies under its camera as its own depth tells; where the
+            reconstruction has refined a recorded camera, the road moves along with it.
+        novel: Whether the frame was drawn from the reconstruction; its camera stands right then.
+        threads: Of the rasteriser.
     """
     frame = site.frame
     camera, plane = small_camera(site), Plane(*road_of(site))
-    refined = reconstruction.cameras.get(frame.key)
+    refined = None if novel else reconstruction.cameras.get(frame.key)
     if refined is not None:
         moved = refined.world_from_camera @ np.linalg.inv(camera.world_from_camera)
         camera = replace(camera, world_from_camera=refined.world_from_camera)

@@ -37,8 +37,8 @@ OWN_ROWS = 2.0
 class Seen(NamedTuple):
     """The street's mirror image in the road's plane, on the small grid (h, w) of a site.
 
-    In the picture's own places, as if the road were glass with the mirrored street below it; without
-    the ground itself, what is below it, and the sky.
+    In the picture's own places, as if the road were glass with the mirrored street below it; the
+    ground itself, what is below it, and the sky are left out.
     """
 
     srgb: Float32

@@ -6,6 +6,7 @@ import numpy as np
 
 from weather_aug.clip.types import Camera, Frame, FrameKey
 from weather_aug.colour import srgb_from_linear
+from weather_aug.edit.physical.mirror_seen import Seen
 from weather_aug.edit.physical.site import site_of
 from weather_aug.taxonomy import ROAD, SKY, TRAIN_ID
 
@@ -99,12 +100,8 @@ class Scene:
 
     def mirrored(self):
         """What the road mirrors, by tracing: light (H, W, 3), and where the picture shows it."""
-        origin, rays = self.rays()
-        down = rays[..., 2] < -1e-9
-        way = np.where(down, -origin[2] / np.where(down, rays[..., 2], 1.0), 1.0)
-        road = origin + way[..., None] * rays
-        away = rays * np.array([1.0, 1.0, -1.0])
-        distance, classes, light = self.seen(road, away, with_road=False)
+        origin = self.camera.centre_world
+        down, (road, away), (distance, classes, light) = self._traced_from_the_road()
         surface = down & (classes != SKY)
         points = road + np.where(surface, distance, 1.0)[..., None] * away
         camera = self.camera
@@ -117,6 +114,26 @@ class Scene:
         shown = depth[row, column].reshape(inside.shape)
         known = inside & (np.abs(shown - from_camera[..., 2]) < 0.02 * shown)
         return light, down & (known | (classes == SKY))
+
+    def seen_in_the_road(self):
+        """What a render of the mirror image shows: exactly what the road mirrors, on 1:1 cells."""
+        down, (road, away), (distance, classes, light) = self._traced_from_the_road()
+        surface = down & (classes != SKY)
+        ahead = self.camera.world_from_camera[:3, 2]
+        # A mirror image lies as far behind the road as the thing before it, along the old ray.
+        depth = (road - self.camera.centre_world) @ ahead
+        depth = depth + np.where(surface, distance, 0.0) * ((away * (1, 1, -1)) @ ahead)
+        srgb = srgb_from_linear(np.where(surface[..., None], light, 0.0))
+        return Seen(*(a.astype(np.float32) for a in (srgb, depth, surface)))
+
+    def _traced_from_the_road(self):
+        """Where rays go down, (place, direction) of their mirrored rays, and what those meet."""
+        origin, rays = self.rays()
+        down = rays[..., 2] < -1e-9
+        way = np.where(down, -origin[2] / np.where(down, rays[..., 2], 1.0), 1.0)
+        road = origin + way[..., None] * rays
+        away = rays * np.array([1.0, 1.0, -1.0])
+        return down, (road, away), self.seen(road, away, with_road=False)
 
 
 def sunk(site, metres):

@@ -10,6 +10,7 @@ none of it; its frames are then looked at when they are rendered, to the same nu
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +20,8 @@ from numpy.typing import NDArray
 
 from weather_aug.clip.types import Camera, Frame
 from weather_aug.edit.physical.layers import NAMES, Layers, layers_of, thumbnail_shape
-from weather_aug.edit.physical.site import STEEPEST_SLOPE, site_of
+from weather_aug.edit.physical.mirror_seen import Seen
+from weather_aug.edit.physical.site import STEEPEST_SLOPE, Site, site_of
 from weather_aug.errors import SceneError, printable
 from weather_aug.scene.arrays import mapped, npy_bytes
 from weather_aug.scene.route import part_near
@@ -62,11 +64,24 @@ class LayersRecord:
     illumination: float
 
 
-def layers_seen(frame: Frame, street: Street) -> Layers:
-    """Look at a frame of a drive, or of none."""
+def layers_seen(
+    frame: Frame, street: Street, mirrored: Callable[[Site], Seen] | None = None
+) -> Layers:
+    """Look at a frame of a drive, or of none.
+
+    Args:
+        frame: With depth.
+        street: What its drive knows.
+        mirrored: Renders the street's mirror image in a site's road, as `geometry.seen_in_road`
+            does; None where the drive is not reconstructed.
+    """
     site = site_of(frame, street.axes_world, street.camera_height_m)
     route = street.route
-    return layers_of(site, None if route is None else part_near(route, site.origin[:2]))
+    return layers_of(
+        site,
+        None if route is None else part_near(route, site.origin[:2]),
+        None if mirrored is None else mirrored(site),
+    )
 
 
 def encode_layers(frame: Frame, layers: Layers) -> tuple[dict[str, Any], dict[str, bytes]]:

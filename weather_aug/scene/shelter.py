@@ -76,6 +76,17 @@ class View(NamedTuple):
     """(H, W) train ids."""
 
 
+class Points(NamedTuple):
+    """Surface points of a drive whose geometry is known; what moves is not among them."""
+
+    street_m: Float64
+    """(N, 3) street coordinates, evenly over the surfaces, `CELL_M` / 2 apart."""
+    above_camera_m: Float64
+    """(N,) height over the camera that came nearest."""
+    label: NDArray[np.uint8] | None
+    """(N,) train ids."""
+
+
 class _Table(NamedTuple):
     """Points counted by column and layer, (N,) each, sorted by key."""
 
@@ -122,6 +133,33 @@ def shelter_of(views: Iterable[View], axes_world: Float64) -> Shelter | None:
     return _mapped(cells, cover_m, reference_m, axes_world, labelled)
 
 
+def shelter_of_points(points: Points, axes_world: Float64, reference_m: Float64) -> Shelter | None:
+    """Map the covers among a drive's surfaces, by the same rules.
+
+    Each point counts as seen in as many frames as are asked for: a surface that only one frame
+    showed is not reconstructed where it is.
+
+    Args:
+        points: Of the surfaces.
+        axes_world: (3, 3), rows: along the street, to the left, up.
+        reference_m: (3,) street coordinates of a place in the drive.
+
+    Returns:
+        The map, cut to the covers; None where the sky is open everywhere.
+
+    Raises:
+        SceneError: If the covers lie too far apart for one map.
+    """
+    is_cover = points.above_camera_m > LEAST_ABOVE_CAMERA_M
+    if points.label is not None:
+        is_cover &= _COVERS[points.label]
+    table = _tabulated(points.street_m - reference_m, is_cover)
+    cells, cover_m = _covered(table._replace(frames=LEAST_FRAMES * table.frames))
+    if len(cells) == 0:
+        return None
+    return _mapped(cells, cover_m, reference_m, axes_world, points.label is not None)
+
+
 def _counted(view: View, axes_world: Float64, reference_m: Float64) -> _Table:
     """Count one frame's points."""
     street, slope, label = _points(view, axes_world)
@@ -129,7 +167,11 @@ def _counted(view: View, axes_world: Float64, reference_m: Float64) -> _Table:
     is_cover = (slope > LEAST_SLOPE) & (above_m > LEAST_ABOVE_CAMERA_M)
     if label is not None:
         is_cover &= _COVERS[label]
-    place = street - reference_m
+    return _tabulated(street - reference_m, is_cover)
+
+
+def _tabulated(place: Float64, is_cover: Mask) -> _Table:
+    """Count points (N, 3), metres from the reference, by column and layer, as of one frame."""
     index = np.floor(place / (CELL_M, CELL_M, LAYER_M)).astype(np.int64)
     inside = (np.abs(index) < (_HALF - 1, _HALF - 1, _HALF_LAYERS - LAYERS_BELOW)).all(axis=1)
     index += (_HALF, _HALF, _HALF_LAYERS)

@@ -16,6 +16,7 @@ from weather_aug._rows import halves
 from weather_aug.colour import LUMINANCE
 from weather_aug.edit.physical import relight, settling
 from weather_aug.edit.physical.mirror import mirror_map, mirrored
+from weather_aug.edit.physical.mirror_seen import Seen, with_seen
 from weather_aug.edit.physical.overcast import ZENITH_GAIN
 from weather_aug.edit.physical.site import Site
 from weather_aug.edit.surface import shared
@@ -61,19 +62,24 @@ class Layers:
     """(h', w', 3) sRGB, the picture at most 256 pixels wide: what glass and glare see of it."""
 
 
-def layers_of(site: Site, path: Float64 | None = None) -> Layers:
+def layers_of(site: Site, path: Float64 | None = None, seen: Seen | None = None) -> Layers:
     """Look at a frame's surfaces.
 
     Args:
         site: The frame.
         path: (P, 2) places of the camera in the order driven, street axes (along, left); None where
             nobody knows: the way then goes straight ahead.
+        seen: A render of the street's mirror image in the road; None where there is no geometry to
+            render: what the road mirrors is then found in the picture.
     """
     flat = relight.flattening(site)
     lit = relight.illumination(site, flat)
     mirror = mirror_map(site)
     surfaces = np.where(site.small_classes[..., None] == SKY, 0.0, overcast_light(site, flat))
-    shown = mirrored(mirror, surfaces.astype(np.float32), np.zeros((2, 3)))
+    surfaces = surfaces.astype(np.float32)
+    if seen is not None:
+        mirror, surfaces = with_seen(site, flat, mirror, surfaces, seen)
+    shown = mirrored(mirror, surfaces, np.zeros((2, 3)))
     sky_gain = np.array([[1.0] * 3, [1.0 + ZENITH_GAIN] * 3])
     free = mirrored(mirror, np.zeros_like(site.light), sky_gain)
     luminance = site.light @ LUMINANCE.astype(np.float32)

@@ -18,14 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import weather_aug as wa
-from weather_aug.gaussians.fit import FitOptions
-from weather_aug.scene.viewpoint import Viewpoint
 from weather_aug.taxonomy import coloured
 from weather_aug.view.sheet import grid, write_png
 from weather_aug.view.video import clip_fps, keys_of, write_video
 
 UInt8 = NDArray[np.uint8]
-QUICK = FitOptions(steps=100, count=5_000, sky_size=64)
+QUICK = wa.FitOptions(steps=100, count=5_000, sky_size=64)
 
 
 def beside(
@@ -34,7 +32,7 @@ def beside(
     """Each recorded moment from beside: picture, label in colours, and the share that was seen."""
     for key in keys_of(scene, camera):
         # To the left of the way, or with a negative number to its right.
-        viewpoint = Viewpoint(lateral_m=lateral_m)
+        viewpoint = wa.Viewpoint(lateral_m=lateral_m)
         shot = scene.render(key, weather, seed=seed, viewpoint=viewpoint)
         label = shot.label
         if label is None:

@@ -14,7 +14,7 @@ from weather_aug.clip.types import MAX_SPEED_M_PER_S, Box, Camera, Frame
 from weather_aug.gaussians.actors import pose_at
 from weather_aug.gaussians.draw import View, view
 from weather_aug.gaussians.gather import Weights, camera_of
-from weather_aug.gaussians.types import Actor, Gaussians, Reconstruction, Sky
+from weather_aug.gaussians.types import CLASSES, Actor, Gaussians, Reconstruction, Sky
 from weather_aug.render.compose import RenderedFrame
 from weather_aug.render.label import kept_labels
 from weather_aug.render.label_snow import buried_borders, covered_faces, snow_limits
@@ -212,7 +212,7 @@ def warm_up() -> None:
         np.zeros((1, 3), np.float32),
         np.zeros(1, np.float32),
         np.zeros((1, 1, 3), np.float32),
-        np.ones((1, 1), np.float16),
+        np.ones((1, CLASSES), np.float16),
     )
     none = Gaussians(*(getattr(point, field.name)[:0] for field in fields(Gaussians)))
     sky = Sky(np.zeros((6, 2, 2, 3), np.float32), np.ones((6, 2, 2), np.bool_))

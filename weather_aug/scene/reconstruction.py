@@ -253,7 +253,7 @@ def _gaussians(arrays: Arrays, which: str) -> Gaussians:
     scores = fields["class_scores"]
     if scores is None:
         fields["class_scores"] = np.zeros((count, 0), np.float16)
-    elif scores.shape[1] > CLASSES:
+    elif scores.shape[1] not in (0, CLASSES):
         raise ValueError(f"{which} has scores of {scores.shape[1]} classes, there are {CLASSES}")
     gaussians = Gaussians(**fields)
     squares = np.einsum("ij,ij->i", gaussians.quaternions, gaussians.quaternions)

@@ -218,7 +218,7 @@ def _exposure(reconstruction: Reconstruction, key: FrameKey) -> Float32:
 
 def _light(srgb: Float32) -> Float32:
     """Linear light of sRGB values at least 0, and never nothing, so that it can be scaled."""
-    return (linear_from_srgb(srgb) + BLACK).astype(np.float32)
+    return (linear_from_srgb(srgb.astype(np.float64)) + BLACK).astype(np.float32)
 
 
 def _factor(
@@ -270,7 +270,15 @@ def _through(scene: Splats, optics: Optics, medium: Medium, carried: Float32) ->
 
 
 @compiled
-def _fill_through(parts, depths, radii, optics, medium, carried, out):
+def _fill_through(
+    parts: Float32,
+    depths: Float32,
+    radii: Float32,
+    optics: Optics,
+    medium: Medium,
+    carried: Float32,
+    out: Float32,
+) -> None:
     for n in range(depths.shape[0]):
         if not radii[n] > np.float32(0.0):
             continue

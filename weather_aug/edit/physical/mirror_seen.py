@@ -155,23 +155,24 @@ def relit(view: View, flat: relight.Flattening, place: Float32, srgb: Float32) -
     )  # fmt: skip
     luma = srgb @ LUMINANCE.astype(np.float32)
     gain = np.clip(gains[..., 0] * luma + gains[..., 1], relight.LEAST_GAIN, relight.MOST_GAIN)
-    return (linear_from_srgb(srgb) * np.exp(gain)[..., None]).astype(np.float32)
+    return (linear_from_srgb(srgb.astype(np.float64)) * np.exp(gain)[..., None]).astype(np.float32)
 
 
 def _pixels(view: View, place: Float32) -> tuple[Float32, Float32]:
     """Columns and rows (h, w) at which the camera sees places; behind it, somewhere far off."""
     z = np.maximum(place[..., 2], np.float32(1e-3))
-    return place[..., 0] / z * view.fx + view.cx, place[..., 1] / z * view.fy + view.cy
+    column, row = place[..., 0] / z * view.fx + view.cx, place[..., 1] / z * view.fy + view.cy
+    return column.astype(np.float32), row.astype(np.float32)
 
 
 def _seen_through(site: Site, view: View, place: Float32) -> NDArray[np.bool_]:
     """Where (h, w) the picture looks at a place and sees what is far behind it."""
     column, row = (np.round(k) for k in _pixels(view, place))
     inside = _inside(site.shape, place, column, row)
-    row, column = (np.where(inside, k, 0).astype(np.intp) for k in (row, column))
+    cell = tuple(np.where(inside, k, 0).astype(np.intp) for k in (row, column))
     # The farthest of the neighbours would call every edge an opening; the nearest forgives a cell.
     nearest = cv2.erode(site.depth_m, np.ones((3, 3), np.uint8))
-    return inside & (nearest[row, column] > THROUGH * place[..., 2])
+    return inside & (nearest[cell] > THROUGH * place[..., 2])
 
 
 def _is_shown(site: Site, guessed: MirrorMap, rays: Float32, climb: Float32) -> NDArray[np.bool_]:

@@ -6,8 +6,9 @@ import json
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ from numpy.typing import NDArray
 from weather_aug import _files, _lock
 from weather_aug.clip.types import Clip, Frame, FrameKey
 from weather_aug.edit.ambience import ambience_of
+from weather_aug.edit.physical.mirror_seen import Seen
+from weather_aug.edit.physical.site import Site
 from weather_aug.errors import (
     ArgumentError,
     ClipError,
@@ -28,7 +31,7 @@ from weather_aug.scene.journal import Round, digest_record, make_all
 from weather_aug.scene.layers import PARTS as LAYER_PARTS
 from weather_aug.scene.layers import encode_layers, layers_seen
 from weather_aug.scene.policy import TYPES
-from weather_aug.scene.reconstruct import FITTING, Wanted, write_reconstruction
+from weather_aug.scene.reconstruct import FITTING, Built, Wanted, write_geometry, write_styles
 from weather_aug.scene.records import (
     FRAMES,
     SHELTER,
@@ -40,6 +43,9 @@ from weather_aug.scene.records import (
 )
 from weather_aug.scene.route import street_axes
 from weather_aug.scene.shelter import View, shelter_of
+
+if TYPE_CHECKING:
+    from weather_aug.gaussians.types import Reconstruction
 
 EDITORS = ("physical",)
 JOURNAL, LAYERS_JOURNAL = "journal.jsonl", "layers.jsonl"
@@ -129,7 +135,6 @@ def _content(
         airlight = np.median([entry["light"]["airlight"] for entry in entries], axis=0).tolist()
         shelter, file = _write_shelter(work, entries, axes_world)
         files |= file
-    entries, looks = _write_layers(work, entries, axes_world, is_drive, progress)
     content = {
         "name": clip.name,
         "editor": editor,
@@ -138,16 +143,21 @@ def _content(
         "airlight": airlight,
         "shelter": shelter,
         "frames": entries,
-        "files": files | looks,
+        "files": files,
     }
-    if wanted is None:
+    built = None
+    if wanted is not None:
+        # Before the layers: with Gaussians they know what the road mirrors.
+        manifest = store.manifest_of(content)
+        built = write_geometry(work, manifest, files, wanted, progress=progress)
+    entries, looks = _write_layers(work, entries, axes_world, is_drive, progress, built)
+    content |= {"frames": entries, "files": files | looks}
+    if wanted is None or built is None:
         return content
     # Scenes without Gaussians have the manifest that they always had.
     manifest = store.manifest_of(content)
-    entry, gaussians = write_reconstruction(
-        work, manifest, content["files"], wanted, progress=progress
-    )
-    return content | {"reconstruction": entry, "files": content["files"] | gaussians}
+    built = write_styles(work, manifest, content["files"], built, wanted, progress=progress)
+    return content | {"reconstruction": built.entry, "files": content["files"] | built.files}
 
 
 def _is_drive(clip: Clip) -> bool:
@@ -351,22 +361,31 @@ def _emptied(work: Path) -> None:
 
 
 def _write_layers(
-    work: Path, entries: Entries, axes_world: Float64, is_drive: bool, progress: bool
+    work: Path,
+    entries: Entries,
+    axes_world: Float64,
+    is_drive: bool,
+    progress: bool,
+    built: Built | None,
 ) -> tuple[Entries, Files]:
     """Write what the editor knows of each finished frame; the entries with it, and the digests.
 
     From the stored frames, so that it is what rendering them would find out.
     """
+    mirrored = None if built is None else partial(_seen_in_road, built.scene)
     records = [parse_frame(entry) for entry in entries]
     street_by_camera = streets(records, axes_world, is_drive=is_drive)
     by_key = {record.key: record for record in records}
 
     def made(key: FrameKey) -> tuple[dict[str, Any], dict[str, bytes]]:
         frame = store.read_frame(work, by_key[key])
-        entry, parts = encode_layers(frame, layers_seen(frame, street_by_camera[key.camera]))
+        entry, parts = encode_layers(
+            frame, layers_seen(frame, street_by_camera[key.camera], mirrored)
+        )
         return entry, {part_path(key, part): data for part, data in parts.items()}
 
-    head = {"layers": _digest_of([is_drive, axes_world.tolist(), entries])}
+    gaussians = None if built is None else built.digest
+    head = {"layers": _digest_of([is_drive, axes_world.tolist(), entries, gaussians])}
     keys = tuple(by_key)
     done = make_all(Round("layers", LAYERS_JOURNAL, head, keys, made, _bare), work, progress)
     with_layers: Entries = []
@@ -377,6 +396,13 @@ def _write_layers(
         with_layers.append(entry | {"layers": record["entry"], "files": entry["files"] | paths})
         files |= record["files"]
     return with_layers, files
+
+
+def _seen_in_road(scene: Reconstruction, site: Site) -> Seen:
+    # Loads torch.
+    from weather_aug.scene.geometry import seen_in_road
+
+    return seen_in_road(scene, site)
 
 
 def _bare(work: Path) -> None:

@@ -1,7 +1,7 @@
-"""The third round of a build: the stored frames → Gaussians, their classes, and weather styles.
+"""Rounds of a build: the stored frames → Gaussians and their classes; with layers, weather styles.
 
 Each step stands in a journal of its own, with all that it depends on: geometry on the frames and
-the options, classes on the geometry, each style on the geometry alone. A build that was cut short
+the options, classes on the geometry, styles on the geometry and the layers, which the editor needs. A build that was cut short
 goes on after the last whole step, and within the fit from its last checkpoint.
 """
 
@@ -100,13 +100,33 @@ def wanted_of(options: FitOptions | None, styles: Sequence[str]) -> Wanted:
     return Wanted(options, tuple(styles))
 
 
-def write_reconstruction(
+class Built(NamedTuple):
+    """What is reconstructed so far."""
+
+    entries: tuple[dict[str, Any], ...]
+    """For the manifest, to be joined; of each step."""
+    files: dict[str, Any]
+    """Sizes and digests by relative path."""
+    scene: Reconstruction
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """The manifest's."""
+        return joined(self.entries)
+
+    @property
+    def digest(self) -> str:
+        """Of all files."""
+        return _digest_of(self.files)
+
+
+def write_geometry(
     work: Path, manifest: Manifest, files: Mapping[str, Any], wanted: Wanted, *, progress: bool
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Reconstruct the frames in `work`: the manifest's entry, and sizes and digests of the files.
+) -> Built:
+    """Reconstruct the frames in `work`: geometry, and its classes.
 
     Args:
-        work: Folder with all frames and their layers.
+        work: Folder with all frames.
         manifest: That names them.
         files: Their sizes and digests.
         wanted: What to reconstruct.
@@ -122,27 +142,52 @@ def write_reconstruction(
     # The result does not depend on threads.
     options = asdict(wanted.options) | {"threads": 0}
     head = {"frames": _digest_of(files), "options": _digest_of(options)}
-    geometry, files_of_geometry = _done(
+    entry, made = _done(
         work, "geometry", head, lambda: _geometry(work, manifest, wanted.options, progress)
     )
-    bare = _read(work, geometry, files_of_geometry)
-    head = {"geometry": _digest_of(files_of_geometry)} | head
-    steps: dict[str, Callable[[], Made]] = {
-        "labels": lambda: _labels(work, manifest, wanted.options, bare, progress)
-    }
+    bare = _read(work, entry, made)
+    head = {"geometry": _digest_of(made)} | head
+    classes, more = _done(
+        work, "labels", head, lambda: _labels(work, manifest, wanted.options, bare, progress)
+    )
+    entries, written = (entry, classes), made | more
+    return Built(entries, written, _read(work, joined(entries), written))
+
+
+def write_styles(
+    work: Path,
+    manifest: Manifest,
+    files: Mapping[str, Any],
+    built: Built,
+    wanted: Wanted,
+    *,
+    progress: bool,
+) -> Built:
+    """Give what was built the colours of the weathers wanted; remove arrays of others.
+
+    Args:
+        work: Folder with all frames, their layers and the geometry.
+        manifest: That names frames and layers.
+        files: Their sizes and digests.
+        built: By `write_geometry`.
+        wanted: What to reconstruct.
+        progress: Show bars.
+
+    Raises:
+        SceneError: If what was fitted cannot be stored.
+        OutputError: If the work folder cannot be written.
+    """
+    entries, written = built.entries, dict(built.files)
     if wanted.styles:
-        steps["styles"] = lambda: _styles(work, manifest, wanted, bare, progress)
-    entries, written = [geometry], dict(files_of_geometry)
-    for name, make in steps.items():
-        more = {"styles": list(wanted.styles)} if name == "styles" else {}
-        entry, made = _done(work, name, head | more, make)
-        entries.append(entry)
-        written |= made
-    entry = joined(entries)
+        names = list(wanted.styles)
+        head = {"frames": _digest_of(files), "geometry": built.digest, "styles": names}
+        entry, made = _done(
+            work, "styles", head, lambda: _styles(work, manifest, wanted, built.scene, progress)
+        )
+        entries, written = (*entries, entry), written | made
     _remove_others(work, written)
     # What is built can be read.
-    _read(work, entry, written)
-    return entry, written
+    return Built(entries, written, _read(work, joined(entries), written))
 
 
 def _done(

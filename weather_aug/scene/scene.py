@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -196,10 +196,16 @@ class WeatherScene:
         stored = store.read_layers(self.path, self._record(frame.key), frame.label)
         return stored or self._looked_at(frame)
 
-    def _looked_at(self, frame: Frame) -> Layers:
+    def _looked_at(self, frame: Frame, *, novel: bool = False) -> Layers:
         street = self._streets[frame.key.camera]
         height_m = raised_height_m(street.camera_height_m, self._raised_m(frame))
-        return layers_seen(frame, street._replace(camera_height_m=height_m))
+        mirrored = None
+        if self.reconstruction is not None:
+            # Loads torch.
+            from weather_aug.scene.geometry import seen_in_road
+
+            mirrored = partial(seen_in_road, self.reconstruction, novel=novel)
+        return layers_seen(frame, street._replace(camera_height_m=height_m), mirrored)
 
     @cached_property
     def _streets(self) -> dict[str, Street]:
@@ -261,7 +267,7 @@ class WeatherScene:
         shown = dict(style=style, amount=amount, without=without_actors, poses=poses)
         novel = self._novel(key, viewpoint, None, None, normals=False, **shown)
         dressing = options if style is None else carried_options(options)
-        look = self._looked_at
+        look = partial(self._looked_at, novel=True)
         shot = self._rendered(novel.frame, look, weather, seed, window, air, dressing)
         return honest(shot, novel, lying_in(style, amount), options)
 

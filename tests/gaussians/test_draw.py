@@ -18,6 +18,7 @@ from weather_aug.clip.types import FrameKey
 from weather_aug.errors import ArgumentError
 from weather_aug.gaussians import draw as module
 from weather_aug.gaussians.draw import FIELDS, facings, view
+from weather_aug.gaussians.gather import one_thread_of_torch
 from weather_aug.gaussians.types import Sky
 from weather_aug.taxonomy import BUILDING, IGNORE, ROAD, SKY, VEGETATION
 
@@ -26,6 +27,12 @@ CAMERA = camera_at(2.0, 0.3)
 TIME_S = 0.3
 HERE = view(STREET, CAMERA, TIME_S)
 BEHIND_THE_WALL = camera_at(20.0, HALF_WIDTH_M + 5.0, -90.0)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    with one_thread_of_torch():
+        yield
 
 
 def rays(camera) -> np.ndarray:

@@ -14,12 +14,18 @@ from weather_aug.clip.types import Frame
 from weather_aug.errors import ArgumentError
 from weather_aug.gaussians import labels as module
 from weather_aug.gaussians.draw import view
-from weather_aug.gaussians.gather import gather, rasterised
+from weather_aug.gaussians.gather import gather, one_thread_of_torch, rasterised
 from weather_aug.gaussians.labels import fit_labels, recorded_support
 from weather_aug.gaussians.types import CLASSES, Reconstruction
 from weather_aug.taxonomy import IGNORE, SKY
 
 STREET = tiny_reconstruction()
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    with one_thread_of_torch():
+        yield
 
 
 def unlabelled(street: Reconstruction) -> Reconstruction:

@@ -14,7 +14,7 @@ from weather_aug.clip.types import Frame, FrameKey
 from weather_aug.errors import ArgumentError, DataError
 from weather_aug.gaussians import styles as module
 from weather_aug.gaussians.draw import view
-from weather_aug.gaussians.gather import gather
+from weather_aug.gaussians.gather import gather, one_thread_of_torch
 from weather_aug.gaussians.styles import _basis, _Colours, _Pictures, fit_style, fit_styles
 from weather_aug.gaussians.types import Reconstruction, Sky
 
@@ -24,6 +24,12 @@ EXPOSURES = {
     key: (np.eye(3, 4) + RNG.normal(0, 0.05, (3, 4))).astype(np.float32) for key in PAINTED.cameras
 }
 EXPOSED = replace(PAINTED, exposures=EXPOSURES)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    with one_thread_of_torch():
+        yield
 
 
 def shots(street: Reconstruction, style: str | None) -> list[Frame]:

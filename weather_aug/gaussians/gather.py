@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -161,6 +162,17 @@ def rasterised(gathered: Gathered, camera: Camera, planes: Tensor, threads: int 
         Pinhole.of(camera),
         threads=threads,
     )
+
+
+@contextmanager
+def one_thread_of_torch() -> Iterator[None]:
+    """Sums of torch depend on its threads, and its small operations lose time by them."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def camera_of(reconstruction: Reconstruction, frame: Frame) -> Camera:

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from weather_aug.clip.types import Frame
 from weather_aug.errors import ArgumentError
-from weather_aug.gaussians.gather import camera_of, gather, rasterised
+from weather_aug.gaussians.gather import camera_of, gather, one_thread_of_torch, rasterised
 from weather_aug.gaussians.types import CLASSES, Float32, Reconstruction
 from weather_aug.taxonomy import SKY
 
@@ -21,6 +21,7 @@ STEPS = 4
 _LEAST = 1e-6
 
 
+@one_thread_of_torch()
 def fit_labels(
     reconstruction: Reconstruction,
     frames: Sequence[Frame],
@@ -85,6 +86,7 @@ def fit_labels(
     )
 
 
+@one_thread_of_torch()
 def recorded_support(
     reconstruction: Reconstruction,
     frames: Sequence[Frame],

@@ -20,7 +20,13 @@ from tqdm import tqdm
 from weather_aug.clip.types import Camera, Frame
 from weather_aug.errors import ArgumentError, DataError, printable
 from weather_aug.gaussians.exposure import nearest
-from weather_aug.gaussians.gather import Gathered, camera_of, gather, rasterised
+from weather_aug.gaussians.gather import (
+    Gathered,
+    camera_of,
+    gather,
+    one_thread_of_torch,
+    rasterised,
+)
 from weather_aug.gaussians.harmonics_kernels import C0, C1
 from weather_aug.gaussians.sky import SkyMap
 from weather_aug.gaussians.types import Pinhole, Reconstruction, Style
@@ -72,6 +78,7 @@ def fit_style(
     )
 
 
+@one_thread_of_torch()
 def fit_styles(
     reconstruction: Reconstruction,
     edited: Mapping[str, Sequence[Frame]],
@@ -118,7 +125,8 @@ def fit_styles(
         name: Style(
             sh=sh[:, :count].transpose(0, 1).half().numpy(),
             actor_sh=sh[:, count:].transpose(0, 1).half().numpy(),
-            sky=sky.clamp(0, 1).half().numpy(),
+            # Unbounded: little of it comes through where it is far from 0..1.
+            sky=sky.half().numpy(),
         )
         for name, sh, sky in zip(edited, fitted.sh.split(3, 2), fitted.sky.split(3, 3), strict=True)
     }

@@ -20,10 +20,11 @@ from benchmarks.report import Row, show, write_results
 from weather_aug import WeatherScene
 from weather_aug.clip.types import Frame
 from weather_aug.gaussians.draw import view
-from weather_aug.gaussians.fit import FitOptions, fit
+from weather_aug.gaussians.fit import fit
 from weather_aug.gaussians.frames import resized, split
 from weather_aug.gaussians.gather import camera_of
 from weather_aug.gaussians.labels import fit_labels, recorded_support
+from weather_aug.gaussians.options import FitOptions
 from weather_aug.gaussians.styles import fit_styles
 from weather_aug.gaussians.types import Reconstruction, Style
 from weather_aug.scene.reconstruct import styled_frame

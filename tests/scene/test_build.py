@@ -466,10 +466,10 @@ def interrupt_second(out: Path, index: int, monkeypatch: pytest.MonkeyPatch) -> 
     seen = building.layers_seen
     key = TinyClip().keys[index]
 
-    def cut(frame: Frame, street: Street) -> Layers:
+    def cut(frame: Frame, street: Street, mirrored: None) -> Layers:
         if frame.key == key:
             raise RuntimeError("power cut")
-        return seen(frame, street)
+        return seen(frame, street, mirrored)
 
     with monkeypatch.context() as patch:
         patch.setattr(building, "layers_seen", cut)

@@ -6,8 +6,7 @@ import hashlib
 import json
 import math
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +22,7 @@ from weather_aug.errors import ArgumentError
 from weather_aug.gaussians import checkpoint, loss
 from weather_aug.gaussians.densify import Densification, Relocation
 from weather_aug.gaussians.frames import Target, resized, split, target_of
+from weather_aug.gaussians.gather import one_thread_of_torch
 from weather_aug.gaussians.initialise import scene_radius_m
 from weather_aug.gaussians.model import Model, Seen
 from weather_aug.gaussians.options import FitOptions
@@ -101,24 +101,13 @@ def fit(
         seed=options.seed,
         device=device,
     )
-    with _one_thread_of_torch():
+    with one_thread_of_torch():
         task = _Task(model, options, learnt, checkpoints)
         task.run(progress)
         record = task.record() | _measured(model, options, learnt, "")
         if held_out:
             record |= _measured(model, options, held_out, "held_out_")
     return Fitted(model.reconstruction(), record)
-
-
-@contextmanager
-def _one_thread_of_torch() -> Iterator[None]:
-    """Sums of torch depend on its threads, and its small operations lose time by them."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 class _Task:

@@ -70,7 +70,7 @@ def _nearest(plane: NDArray[Any] | None, height: int, width: int) -> NDArray[Any
 def target_of(frame: Frame, device: torch.device | str = "cpu") -> Target:
     """A frame as tensors on a device."""
     shape = frame.image.shape[:2]
-    image = torch.from_numpy(frame.image).float() / 255.0
+    image = torch.from_numpy(frame.image.astype(np.float32)) / 255.0
     if frame.depth_m is None:
         depth = np.zeros(shape, np.float32)
         is_known = np.zeros(shape, bool)

@@ -145,7 +145,7 @@ class Model:
             colours_seen(sh, means, centre, degree),
             camera_from_world,
             pinhole,
-            background=self.sky.background(pinhole, frame.camera.world_from_camera),
+            background=self.sky.background(pinhole, _world_from_camera(camera_from_world)),
             threads=threads,
         )
         if is_learnt:
@@ -197,16 +197,14 @@ class Model:
 
     def step(self) -> None:
         """One step of all optimisers, then no gradients."""
-        rigid = torch.tensor([not actor.is_deformable for actor in self.poses.actors])
-        if self.has_actors:
-            offsets = self.moving.parameters["offsets_m"]
-            if offsets.grad is not None:
-                offsets.grad[rigid.to(self.device)[self.moving.constants["owners"]]] = 0.0
         for pool in self.pools:
             pool.step()
             pool.zero_grad()
         self._others.step()
         self._others.zero_grad()
+        with torch.no_grad():
+            # As `to_sky` has it, so that what is stored shows what was learnt.
+            self.sky.faces.clamp_(0.0, 1.0)
 
     def state(self) -> dict[str, Tensor]:
         """All that is needed to go on, by name; see `Pool.state`."""
@@ -258,6 +256,14 @@ class Model:
             cameras={FrameKey(*key): self.cameras.refined(key) for key in recorded},
             exposures=self.exposures.by_key(),
         )
+
+
+def _world_from_camera(camera_from_world: Tensor) -> Tensor:
+    """The inverse of a rigid motion, without its gradient."""
+    rotation, shift = camera_from_world[:3, :3].detach(), camera_from_world[:3, 3:].detach()
+    inverse = torch.eye(4, dtype=rotation.dtype, device=rotation.device)
+    inverse[:3] = torch.cat([rotation.T, -rotation.T @ shift], dim=1)
+    return inverse
 
 
 def _check_places(frames: Sequence[Frame]) -> None:

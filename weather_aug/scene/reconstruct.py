@@ -1,8 +1,9 @@
 """Rounds of a build: the stored frames → Gaussians and their classes; with layers, weather styles.
 
 Each step stands in a journal of its own, with all that it depends on: geometry on the frames and
-the options, classes on the geometry, styles on the geometry and the layers, which the editor needs. A build that was cut short
-goes on after the last whole step, and within the fit from its last checkpoint.
+the options, classes on the geometry, styles on the geometry and on the layers, which the editor
+needs. A build that was cut short goes on after the last whole step, and within the fit from its
+last checkpoint.
 """
 
 from __future__ import annotations

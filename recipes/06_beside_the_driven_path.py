@@ -23,6 +23,7 @@ from weather_aug.view.sheet import grid, write_png
 from weather_aug.view.video import clip_fps, keys_of, write_video
 
 UInt8 = NDArray[np.uint8]
+CLEAN_GLASS = wa.RenderOptions(without=("drops", "wipers", "lens_veil"))
 QUICK = wa.FitOptions(steps=100, count=5_000, sky_size=64)
 
 
@@ -33,7 +34,7 @@ def beside(
     for key in keys_of(scene, camera):
         # To the left of the way, or with a negative number to its right.
         viewpoint = wa.Viewpoint(lateral_m=lateral_m)
-        shot = scene.render(key, weather, seed=seed, viewpoint=viewpoint)
+        shot = scene.render(key, weather, seed=seed, viewpoint=viewpoint, options=CLEAN_GLASS)
         label = shot.label
         if label is None:
             yield shot.image, np.zeros_like(shot.image), float("nan")
@@ -53,7 +54,7 @@ def main() -> None:
     """Fly beside the way of the scene given, or of a small street."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scene", type=Path, nargs="?")
-    parser.add_argument("--camera", help="the first one if not given")
+    parser.add_argument("--camera", help="the one ahead, or the first, if not given")
     parser.add_argument("--lateral", type=float, default=1.5, help="to the left of the way, metres")
     parser.add_argument("--severity", default="heavy")
     parser.add_argument("--seed", type=int, default=0)
@@ -65,7 +66,8 @@ def main() -> None:
             scene = small_street(Path(temporary), frames=3, width=160, height=96)
         else:
             scene = wa.WeatherScene.load(given.scene)
-        camera = given.camera or scene.cameras[0]
+        ahead = "front" if "front" in scene.cameras else scene.cameras[0]
+        camera = given.camera or ahead
         weather = wa.Weather.snow(given.severity)
         shots = list(beside(scene, camera, given.lateral, weather, given.seed))
         for (_, _, share), key in zip(shots, keys_of(scene, camera), strict=True):

@@ -483,9 +483,9 @@ def looked(monkeypatch: pytest.MonkeyPatch) -> list[FrameKey]:
     keys: list[FrameKey] = []
     seen = building.layers_seen
 
-    def noted(frame: Frame, street: Street) -> Layers:
+    def noted(frame: Frame, street: Street, mirrored: None) -> Layers:
         keys.append(frame.key)
-        return seen(frame, street)
+        return seen(frame, street, mirrored)
 
     monkeypatch.setattr(building, "layers_seen", noted)
     return keys
@@ -529,7 +529,7 @@ def test_layers_of_another_look_are_thrown_away(
         patch.setattr(
             building,
             "layers_seen",
-            lambda frame, street: seen(frame, street._replace(route=aside)),
+            lambda frame, street, mirrored: seen(frame, street._replace(route=aside), mirrored),
         )
         interrupt_second(out, 6, patch)
     stray = out.with_name(out.name + WORK) / store.part_path(TinyClip().keys[0], "classes")

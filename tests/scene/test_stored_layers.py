@@ -317,8 +317,8 @@ def test_surfaces_that_cannot_be_told_are_bad_input(
     """A planted fault: the editor makes a number that is none. Nothing is left behind."""
     seen = storing.layers_seen
 
-    def spoilt(frame: Frame, street: storing.Street) -> Layers:
-        layers = seen(frame, street)
+    def spoilt(frame: Frame, street: storing.Street, mirrored: None) -> Layers:
+        layers = seen(frame, street, mirrored)
         maps = np.where(np.arange(20)[:, None, None] == 7, np.float16(np.nan), layers.maps)
         return replace(layers, maps=maps)
 

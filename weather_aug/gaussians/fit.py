@@ -252,7 +252,7 @@ class _Task:
     def _take_up(self) -> None:
         """Go on where the last process stopped, if it did the same."""
         found = None if self.folder is None else checkpoint.load(self.folder)
-        if found is None or any(found[0].get(k) != json_of(v) for k, v in self._head.items()):
+        if found is None or any(found[0].get(k) != _json_of(v) for k, v in self._head.items()):
             return
         head, state = found
         self.model.restore(state)
@@ -284,7 +284,7 @@ def _spread(values: Tensor, rows: Tensor, count: int) -> Tensor:
     return whole
 
 
-def json_of(value: Any) -> Any:
+def _json_of(value: Any) -> Any:
     """What JSON makes of a value."""
     return json.loads(json.dumps(value))
 

@@ -188,8 +188,15 @@ def sky_of(reconstruction: Reconstruction, style: str | Weights | None, amount: 
     sky = reconstruction.sky
     if not weights:
         return sky
-    styled = {name: reconstruction.styles[name].sky for name in weights}
+    side = sky.faces.shape[1]
+    styled = {name: _enlarged(reconstruction.styles[name].sky, side) for name in weights}
     return Sky(_blend(sky.faces, styled, weights), sky.seen)
+
+
+def _enlarged(faces: NDArray[Any], side: int) -> NDArray[Any]:
+    """Faces (6, S, S, 3) of fewer texels, each repeated."""
+    times = side // faces.shape[1]
+    return faces if times == 1 else faces.repeat(times, axis=1).repeat(times, axis=2)
 
 
 def style_weights(

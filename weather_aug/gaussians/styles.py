@@ -120,6 +120,7 @@ def fit_styles(
     mean = (weights.sky * change.sky).sum((0, 1, 2)) / weights.sky.sum().clamp_min(1e-6)
     change = change._replace(sky=torch.where(unseen, mean, change.sky))
     fitted = start.plus(torch.ones(3 * len(edited)), change)
+    fitted = fitted._replace(sky=_halved(fitted.sky, weights.sky))
     count = len(reconstruction.background)
     added = {
         name: Style(
@@ -131,6 +132,17 @@ def fit_styles(
         for name, sh, sky in zip(edited, fitted.sh.split(3, 2), fitted.sky.split(3, 3), strict=True)
     }
     return replace(reconstruction, styles={**reconstruction.styles, **added})
+
+
+def _halved(faces: Tensor, weights: Tensor) -> Tensor:
+    """Faces (6, S, S, C) with half as many texels along each side, by weights (6, S, S, 1)."""
+    side = faces.shape[1]
+    if side == 1:
+        return faces
+    blocks = (6, side // 2, 2, side // 2, 2)
+    # A trace where nothing was seen, so that the mean there is a plain one.
+    held = weights.reshape(*blocks, 1) + 1e-6
+    return (faces.reshape(*blocks, -1) * held).sum((2, 4)) / held.sum((2, 4))
 
 
 def _solved(pictures: _Pictures, residual: _Colours, weights: _Colours, steps: int) -> _Colours:

@@ -129,7 +129,7 @@ class Style:
     actor_sh: NDArray[Any]
     """(M, K, 3) float16 of the actors' Gaussians."""
     sky: NDArray[Any]
-    """(6, S, S, 3) float16."""
+    """(6, T, T, 3) float16 with T = S, or a part of it: skies in weather have no fine detail."""
 
 
 @dataclass(frozen=True, eq=False)

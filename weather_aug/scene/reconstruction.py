@@ -306,10 +306,13 @@ def _cameras(arrays: Arrays, record: ReconstructionRecord) -> dict[FrameKey, Cam
 
 def _style(arrays: Arrays, name: str, count: int, moving: int, side: int) -> Style:
     style = Style(**{part: arrays[style_array(name, part)] for part in STYLE_KINDS})
+    coarse = style.sky.shape[1]
+    if not 0 < coarse <= side or side % coarse:
+        raise ValueError(f"the sky of style {name} must have a part of the {side} texels a side")
     shapes: dict[str, tuple[int, ...]] = {
         "sh": (count, style.sh.shape[1], 3),
         "actor_sh": (moving, style.actor_sh.shape[1], 3),
-        "sky": (6, side, side, 3),
+        "sky": (6, coarse, coarse, 3),
     }
     _check_shapes(arrays, {style_array(name, part): shape for part, shape in shapes.items()})
     if not {style.sh.shape[1], style.actor_sh.shape[1]} <= set(SH_COEFFICIENTS):

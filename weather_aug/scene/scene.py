@@ -265,7 +265,9 @@ class WeatherScene:
         from weather_aug.scene.novel import honest
 
         shown = dict(style=style, amount=amount, without=without_actors, poses=poses)
-        novel = self._novel(key, viewpoint, None, None, normals=False, **shown)
+        # A style has its snow already; the editor asks where surfaces face up.
+        has_normals = style is None
+        novel = self._novel(key, viewpoint, None, None, normals=has_normals, **shown)
         dressing = options if style is None else carried_options(options)
         look = partial(self._looked_at, novel=True)
         shot = self._rendered(novel.frame, look, weather, seed, window, air, dressing)

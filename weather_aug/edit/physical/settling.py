@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from weather_aug.edit.physical.site import Site
+from weather_aug.edit.physical.site import Site, shrunk
 from weather_aug.taxonomy import SKY
 
 Float32 = NDArray[np.float32]
@@ -21,7 +21,24 @@ def facing_up(site: Site) -> Float32:
     """How level surfaces lie, (h, w) in [0, 1]: the upward part of their normals; 0 in the sky.
 
     From the places of the cell above and the cell below; across a jump of depth nothing is level.
+    Where the frame has normals they must agree: a picture of Gaussians has a depth that is not
+    smooth enough to tell a wall from a roof, and normals that mean little on small round things.
     """
+    up = _up_of_places(site)
+    if site.frame.normals_world is not None:
+        up = np.minimum(up, _up_of_normals(site))
+    up[site.small_classes == SKY] = 0.0
+    up[site.is_ground] = 1.0
+    return cv2.blur(up.astype(np.float32), (3, 3))
+
+
+def _up_of_normals(site: Site) -> Float32:
+    normals = np.asarray(site.frame.normals_world, np.float32)
+    up = shrunk(normals @ site.axes_world[2].astype(np.float32), site.step)
+    return np.clip(up, 0.0, 1.0)
+
+
+def _up_of_places(site: Site) -> Float32:
     points = site.offsets
     with np.errstate(invalid="ignore"):
         rise = np.zeros_like(points)
@@ -29,9 +46,8 @@ def facing_up(site: Site) -> Float32:
         away = np.hypot(rise[..., 0], rise[..., 1])
         up = away / np.sqrt(away**2 + rise[..., 2] ** 2 + ROUGH_M**2)
         jump = away > 0.5 + 0.25 * site.depth_m
-    up[~np.isfinite(up) | jump | (site.small_classes == SKY)] = 0.0
-    up[site.is_ground] = 1.0
-    return cv2.blur(up.astype(np.float32), (3, 3))
+    up[~np.isfinite(up) | jump] = 0.0
+    return up.astype(np.float32)
 
 
 def lateral_m(site: Site, path: Float64 | None) -> Float32:

@@ -146,8 +146,8 @@ def site_of(frame: Frame, axes_world: Float64, camera_height_m: float) -> Site:
     return Site(frame, axes_world, camera_height_m, step, classes, plane)
 
 
-def shrunk(plane: UInt8, step: int) -> UInt8:
-    """Means (h, w, ...) of the cells of a plane of levels (H, W, ...)."""
+def shrunk(plane: NDArray[Any], step: int) -> NDArray[Any]:
+    """Means (h, w, ...) of the cells of a plane (H, W, ...)."""
     height, width = plane.shape[:2]
     rows, columns = -(-height // step), -(-width // step)
     if (rows * step, columns * step) != (height, width):

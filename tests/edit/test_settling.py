@@ -155,3 +155,26 @@ def test_nothing_is_farther_than_the_map_can_hold():
     assert side.dtype == np.float32
     assert np.abs(side).max() <= FARTHEST_SIDE_M
     assert np.isfinite(side).all()
+
+
+def test_normals_keep_a_rough_depth_from_making_ledges_of_a_wall():
+    """As of Gaussians drawn from elsewhere; without the normals the wall would hold snow."""
+    frame = Street(boxes=(ROOF, WALL), width=256, height=160, focal_px=200.0).frame
+    rough = frame.depth_m * (
+        1 + 0.02 * np.random.default_rng(0).standard_normal(frame.depth_m.shape)
+    )
+    rough = replace(frame, depth_m=rough.astype(np.float32))
+    kinds, points = frame.label, points_of(frame)
+    wall = inside(kinds == TRAIN_ID["building"])
+    roof = inside((kinds == TRAIN_ID["car"]) & (np.abs(points[..., 2] - 0.7) < 1e-3))
+    normals = np.zeros((*kinds.shape, 3), np.float32)
+    normals[..., 2] = 1.0
+    normals[kinds == TRAIN_ID["building"]] = (-1.0, 0.0, 0.0)
+
+    def up(of):
+        return facing_up(site_of(of, AXES, CAMERA_HEIGHT_M))
+
+    assert up(rough)[wall].mean() > 0.3
+    assert up(replace(rough, normals_world=normals))[wall].max() < 1e-3
+    # Where they agree, nothing changes.
+    assert (up(replace(frame, normals_world=normals))[roof] > 0.8).all()

@@ -308,7 +308,8 @@ def test_interrupted_it_stops_soon_and_continues(
     long: ExportPlan, long_tree: dict[str, str], tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    process = started(long, out, 2)
+    # One item that takes for ever: else all may be done before this process gets its turn.
+    process = started(long, out, 2, fault="sleep_on_one_item")
     wait_for_lines(process, out, 5)
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=5)

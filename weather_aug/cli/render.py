@@ -186,7 +186,7 @@ class Render:
 
     def _ends(self) -> tuple[Weather, Weather]:
         """The weather that there was first, and the one after."""
-        severity = parse_severity(_severity(self.severity))
+        severity = parse_severity(severity_of(self.severity))
         weather = _weather_of(self.weather, severity, self.falling)
         if not self.falling and not {"rain", "snow"} & set(self.weather.split("+")):
             raise ArgumentError(
@@ -231,7 +231,8 @@ def _timeline(path: Path) -> WeatherTimeline:
         raise DataError(f"{printable(path, 200)}: {error}") from None
 
 
-def _severity(text: str) -> float | str:
+def severity_of(text: str) -> float | str:
+    """A number if the text is one, else the text: the name of a stop."""
     try:
         return float(text)
     except ValueError:

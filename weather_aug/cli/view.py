@@ -7,6 +7,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+from weather_aug.cli.render import severity_of
 from weather_aug.cli.terminal import say
 
 
@@ -37,7 +38,7 @@ class View:
         viewer = open_viewer(
             scene,
             weather=self.weather,
-            severity=_severity(self.severity),
+            severity=severity_of(self.severity),
             seed=self.seed,
             host=self.host,
             port=self.port,
@@ -48,10 +49,3 @@ class View:
                 viewer.wait()
             except KeyboardInterrupt:
                 say("closed")
-
-
-def _severity(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text

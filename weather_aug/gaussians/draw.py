@@ -13,8 +13,14 @@ from torch import Tensor
 
 from weather_aug.clip.types import Camera, FrameKey
 from weather_aug.errors import ArgumentError, printable
-from weather_aug.gaussians.exposure import nearest
-from weather_aug.gaussians.gather import Gathered, Weights, gather, rasterised, sky_of
+from weather_aug.gaussians.gather import (
+    Gathered,
+    Weights,
+    exposure_of,
+    gather,
+    rasterised,
+    sky_of,
+)
 from weather_aug.gaussians.rasterise import NEAR_M, Drawn
 from weather_aug.gaussians.rotations import matrices_of
 from weather_aug.gaussians.sky import sky_picture
@@ -84,7 +90,7 @@ def view(
         ArgumentError: If a style, track, field or frame is unknown, or a number leaves its range.
     """
     wanted = _known_fields(want)
-    exposure = None if key is None else _exposure(reconstruction, key)
+    exposure = None if key is None else exposure_of(reconstruction, key)
     with torch.no_grad():
         gathered = gather(
             reconstruction,
@@ -253,16 +259,6 @@ def _bytes(image: Float32, exposure: Float32 | None) -> NDArray[np.uint8]:
     if exposure is not None:
         image = image @ exposure[:, :3].T + exposure[:, 3]
     return np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
-
-
-def _exposure(reconstruction: Reconstruction, key: FrameKey) -> Float32:
-    cameras = {other.camera for other in reconstruction.exposures}
-    if key.camera not in cameras:
-        raise ArgumentError(
-            f"no exposure of camera {printable(key.camera)!r} is known; take a key of "
-            f"{', '.join(sorted(cameras)) or 'none'}, or key=None for the scene's own colours"
-        )
-    return nearest(reconstruction.exposures, key)
 
 
 def _known_fields(want: Collection[str]) -> frozenset[str]:

@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from weather_aug._checks import finite
-from weather_aug.clip.types import Camera, Frame
+from weather_aug.clip.types import Camera, Frame, FrameKey
 from weather_aug.errors import ArgumentError, printable
 from weather_aug.gaussians.actors import offset_bases, pose_at
+from weather_aug.gaussians.exposure import nearest
 from weather_aug.gaussians.harmonics import colours_seen
 from weather_aug.gaussians.placing import placed
 from weather_aug.gaussians.rasterise import Drawn, rasterise
@@ -180,6 +181,21 @@ def camera_of(reconstruction: Reconstruction, frame: Frame) -> Camera:
     camera = reconstruction.cameras.get(frame.key, frame.camera)
     size = (frame.camera.width, frame.camera.height)
     return camera if (camera.width, camera.height) == size else camera.resized(*size)
+
+
+def exposure_of(reconstruction: Reconstruction, key: FrameKey) -> Float32:
+    """(3, 4) of a frame, or of the recorded one of its camera that is nearest in time.
+
+    Raises:
+        ArgumentError: If nothing is known of its camera.
+    """
+    cameras = {other.camera for other in reconstruction.exposures}
+    if key.camera not in cameras:
+        raise ArgumentError(
+            f"no exposure of camera {printable(key.camera)!r} is known; take a key of "
+            f"{', '.join(sorted(cameras)) or 'none'}, or key=None for the scene's own colours"
+        )
+    return nearest(reconstruction.exposures, key)
 
 
 def sky_of(reconstruction: Reconstruction, style: str | Weights | None, amount: float) -> Sky:

@@ -30,9 +30,9 @@ from weather_aug.air import Air, air_of
 from weather_aug.clip.types import Camera, FrameKey
 from weather_aug.colour import linear_from_srgb, srgb_from_linear
 from weather_aug.edit.ambience import Ambience
-from weather_aug.errors import ArgumentError, printable
+from weather_aug.errors import ArgumentError
 from weather_aug.gaussians import blend, projection
-from weather_aug.gaussians.gather import Gathered, Weights, gather, sky_of
+from weather_aug.gaussians.gather import Gathered, Weights, exposure_of, gather, sky_of
 from weather_aug.gaussians.rasterise import NEAR_M
 from weather_aug.gaussians.rasterise_cpu import lens_of
 from weather_aug.gaussians.sky import sky_picture
@@ -113,7 +113,7 @@ def render_joint(
     """
     seed = check_seed("seed", seed)
     _check(weather, options)
-    exposure = None if key is None else _exposure(reconstruction, key)
+    exposure = None if key is None else exposure_of(reconstruction, key)
     camera = camera_in(camera, weather, options)
     gathered = gather(
         reconstruction,
@@ -208,12 +208,6 @@ def _check(weather: Weather, options: RenderOptions) -> None:
             "joint rendering draws preset='physical' with alignment='world' and without multiple "
             "scattering; use compose.render for others"
         )
-
-
-def _exposure(reconstruction: Reconstruction, key: FrameKey) -> Float32:
-    if key not in reconstruction.exposures:
-        raise ArgumentError(f"the reconstruction has no exposure of frame {printable(key)}")
-    return reconstruction.exposures[key]
 
 
 def _light(srgb: Float32) -> Float32:

@@ -9,7 +9,7 @@ from weather_aug.render.options import RenderOptions
 from weather_aug.scene.policy import TYPES, weather_of
 from weather_aug.weather import Weather
 
-CARRIED = (*("relight", "sky", "film", "mirror", "puddles", "ripples", "snow_cover", "tracks"),)
+CARRIED = ("relight", "sky", "film", "mirror", "puddles", "ripples", "snow_cover", "tracks")
 """Effects on surfaces: a style of the Gaussians has them already."""
 STYLE_SEVERITY = "heavy"
 """Of the weather that styles are fitted to; `amount` goes from none of it to all."""

@@ -228,8 +228,8 @@ def test_the_street_is_reconstructed(tmp_path: Path) -> None:
     """The real fit, at toy size: the recorded views come back, with their labels."""
     from weather_aug.clip.open import open_clip
 
-    clip = open_clip("street:?frames=4&width=160&height=90&cameras=front")
-    options = FitOptions(steps=600, count=8000, sky_size=64)
+    clip = open_clip("street:?frames=4&width=160&height=90")
+    options = FitOptions(steps=600, count=20_000, sky_size=64)
     scene = WeatherScene.build(
         clip, tmp_path / "scene", reconstruct=True, reconstruction=options, styles=("snow",)
     )

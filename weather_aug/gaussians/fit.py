@@ -32,6 +32,8 @@ from weather_aug.gaussians.ssim import ssim
 from weather_aug.gaussians.types import Reconstruction
 
 ELONGATION_EVERY = 10
+"""Steps between two pulls at needles. All measurements of docs/reconstruction.md have it so, a
+tenth of OmniRe's pull in all; what the whole of it does was not tried."""
 SAVED_EVERY = 500
 """Steps between two checkpoints."""
 COARSE_SHARE = 0.25
@@ -252,9 +254,12 @@ class _Task:
     def _take_up(self) -> None:
         """Go on where the last process stopped, if it did the same."""
         found = None if self.folder is None else checkpoint.load(self.folder)
-        if found is None or any(found[0].get(k) != _json_of(v) for k, v in self._head.items()):
+        if found is None:
             return
         head, state = found
+        # As it comes back from the file: JSON has no tuples.
+        if any(head.get(k) != v for k, v in json.loads(json.dumps(self._head)).items()):
+            return
         self.model.restore(state)
         for row, densifier in enumerate(self._densifiers):
             prefix = f"densifier.{row}."
@@ -282,11 +287,6 @@ def _spread(values: Tensor, rows: Tensor, count: int) -> Tensor:
     whole = values.new_zeros((count, *values.shape[1:]))
     whole[rows] = values
     return whole
-
-
-def _json_of(value: Any) -> Any:
-    """What JSON makes of a value."""
-    return json.loads(json.dumps(value))
 
 
 class _Shelf:

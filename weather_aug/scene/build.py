@@ -73,11 +73,13 @@ def build(
     """Write the scene of `clip` to the folder `out`, which appears only when it is complete.
 
     There are two rounds over the frames: the first stores them; the second, when the way driven is
-    known, what the editor sees in each. Where they are wanted, Gaussians follow; see
-    `scene.reconstruct`. Work in progress stands in `out` + ".building" with a journal of each
-    round; the same call again continues it, after making the first finished frame once more to see
-    that the clip is still the same. Bad input removes it: there is nothing to continue. A scene
-    that is replaced stands in `out` + ".replaced" until the new one is in its place.
+    known, what the editor sees in each. Where Gaussians are wanted, their geometry comes between
+    the two, so that the editor sees what the road mirrors, and their styles, which need the
+    editor, after both; see `scene.reconstruct`. Work in progress stands in `out` + ".building" with
+    a journal of each round; the same call again continues it, after making the first finished frame
+    once more to see that the clip is still the same. Bad input removes it: there is nothing to
+    continue. A scene that is replaced stands in `out` + ".replaced" until the new one is in its
+    place.
 
     Args:
         clip: The drive; every frame needs depth.

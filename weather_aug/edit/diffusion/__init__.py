@@ -1,0 +1,1 @@
+"""The paper's editor: one frozen one-step diffusion model, one low-rank set for each weather."""

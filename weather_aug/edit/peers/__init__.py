@@ -1,0 +1,1 @@
+"""Other editors of backgrounds, to compare with."""

@@ -57,8 +57,8 @@ class TemporalViewProcessor:
             attn: The `Attention` layer; its projections may be low-rank layers of peft.
             hidden_states: (B, tokens, channels) or (B, channels, height, width).
             encoder_hidden_states: Has to be None: this is self-attention.
-            attention_mask: As the layer prepares it, of the keys; a picture's mask goes with its
-                keys, whoever looks at them.
+            attention_mask: (B, 1, tokens), added to the scores of a picture's keys, whoever looks
+                at them.
             temb: For a layer with a spatial norm.
 
         Returns:

@@ -1,13 +1,12 @@
 """Colour transfer: the clip gets the picture's mean and spread, by one map for all its frames."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
 from peer_contract import check_is_an_editor, check_is_pure
 from tiny_clip import TinyClip
 
+from weather_aug.clip.types import FrameKey
 from weather_aug.edit.background import Moment
 from weather_aug.edit.peers import colour_transfer
 from weather_aug.edit.peers.colour_transfer import (
@@ -16,6 +15,7 @@ from weather_aug.edit.peers.colour_transfer import (
     lab_of,
     measured,
     moved,
+    sampled,
 )
 from weather_aug.edit.peers.options import PeerOptions
 from weather_aug.errors import ArgumentError
@@ -115,9 +115,10 @@ def test_what_it_needs(pictures):
         ColourTransfer.load(PeerOptions(pictures=pictures, steps=3), CLIP)
 
 
-def test_long_clips_are_sampled(pictures, monkeypatch):
-    read = []
-    long = replace(CLIP, frames=70, cameras=("front",))
-    monkeypatch.setattr(colour_transfer, "measured", lambda images: read.append(len(list(images))))
-    ColourTransfer.load(PeerOptions(pictures=pictures), long)
-    assert read[-1] == 35
+def test_long_clips_are_sampled_with_all_their_cameras():
+    keys = [FrameKey(t, camera) for t in range(100) for camera in ("a", "b", "c")]
+    some = sampled(keys)
+    assert 32 <= len(some) <= 64
+    assert {key.camera for key in some} == {"a", "b", "c"}
+    assert len(set(np.diff(sorted({key.time_index for key in some})))) == 1
+    assert sampled(keys[:6]) == tuple(keys[:6])

@@ -41,12 +41,12 @@ def test_noise_is_keyed(load, moment):
     check_noise_is_keyed(lambda **o: load(prompts=one_style("weather"), **o), moment)
 
 
-def test_noise_of_a_process_is_caught(load, moment, monkeypatch):
-    monkeypatch.setattr(instruct, "generator_of", lambda *_: generator_of(0, (0, "a"), "snow"))
+def test_noise_that_forgets_the_frame_is_caught(load, moment, monkeypatch):
+    key = moment.now[0].key
     monkeypatch.setattr(
-        instruct, "generator_of", lambda *_: generator_of(0, moment.now[0].key, "snow")
+        instruct, "generator_of", lambda seed, _, style: generator_of(seed, key, style)
     )
-    with pytest.raises(AssertionError):
+    with pytest.raises(AssertionError, match="time"):
         check_noise_is_keyed(lambda **o: load(prompts=one_style("weather"), **o), moment)
 
 

@@ -21,6 +21,10 @@ def street():
 
 @pytest.fixture(scope="module")
 def moment(street):
+    return moment_of(street)
+
+
+def moment_of(street):
     return Moment(now=(street.frame,), look=lambda frame: (street.layers, street.ambience))
 
 
@@ -31,7 +35,7 @@ def test_it_is_an_editor(moment):
 
 def check_the_rest_is_as_it_was(street):
     frame = street.frame
-    picture = snowed(frame, street.layers, street.ambience, SnowCover().weather)
+    picture = SnowCover().edit(moment_of(street), "snow")[0]
     bare = np.isin(frame.label, [SKY, TRAIN_ID["person"], TRAIN_ID["pole"]])
     # Caps lie on the topmost pixels of what stands: the sky keeps all its bytes, the rest most.
     sky = frame.label == SKY
@@ -46,14 +50,10 @@ def test_what_holds_no_snow_keeps_its_bytes(street):
 
 
 def test_the_physical_editors_exposure_is_caught(street, monkeypatch):
-    monkeypatch.setattr(snow_cover, "snowed", None)
-    weather = SnowCover().weather
-
     def exposed(frame, layers, ambience, weather):
         return street.edited(weather, without=WITHOUT)
 
-    monkeypatch.setitem(check_the_rest_is_as_it_was.__globals__, "snowed", exposed)
-    assert weather.snow_cover > 0
+    monkeypatch.setattr(snow_cover, "snowed", exposed)
     with pytest.raises(AssertionError):
         check_the_rest_is_as_it_was(street)
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from PIL import Image
 
+from weather_aug.edit.diffusion.spec import CLEAR, PROMPTS
 from weather_aug.errors import ArgumentError, DataError
 from weather_aug.scores import clip
 from weather_aug.scores.clip import clip_ds, clip_s, load_encoder
@@ -186,7 +187,7 @@ def pictures(count=3, height=40, width=70):
 
 
 def by_hand(image):
-    """(1, 3, SIDE, SIDE): the shorter side resized, the middle cut out, OpenAI's mean and spread."""
+    """(1, 3, SIDE, SIDE): shorter side resized, middle cut out, OpenAI's mean and spread."""
     height, width = image.shape[:2]
     size = (SIDE, int(SIDE * height / width))
     if height < width:
@@ -239,7 +240,7 @@ def test_batches_do_not_matter(encoder, monkeypatch):
 def test_from_pictures_to_scores(encoder):
     clear, edited = pictures(2), [image // 2 for image in pictures(2)]
     before, after = encoder.pictures(clear), encoder.pictures(edited)
-    normal, snowy = encoder.texts([clip.CLEAR_PROMPT, clip.PROMPT_BY_STYLE["snow"]])
+    normal, snowy = encoder.texts([PROMPTS[CLEAR], PROMPTS["snow"]])
     assert (np.abs(clip_s(after, snowy)) < 1).all()
     assert (np.abs(clip_ds(after, before, snowy, normal)) > 0).all()
     assert (clip_ds(before, before, snowy, normal) == 0).all()

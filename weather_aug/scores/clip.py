@@ -29,13 +29,6 @@ CLIP_LARGE = "openai/clip-vit-large-patch14"
 """Model that CLIP scores are mostly reported with; 1.7 GB."""
 CLIP_BASE = "openai/clip-vit-base-patch32"
 """The smaller one, 0.6 GB; its scores are other numbers, to be compared with its own only."""
-CLEAR_PROMPT = "Picture of a normal weather scene"
-PROMPT_BY_STYLE = {
-    "rain": "Picture of a rainy weather scene",
-    "snow": "Picture of a snowy weather scene",
-    "fog": "Picture of a foggy weather scene",
-}
-"""What a picture of each style should show, in the words of WeatherEdit's release."""
 BATCH = 16
 _NO_CHANGE = 1e-6
 """A difference of unit embeddings that is no longer than float32 rounding has no direction."""

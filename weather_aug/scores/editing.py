@@ -24,6 +24,9 @@ Images = Mapping[FrameKey, UInt8]
 
 MIN_SHARE = 0.01
 """Pictures that have less than 1 % of their pixels in common do not overlap."""
+NO_CONTRAST = 1e-9
+"""Of the clear pictures' contrast: rounding, in pictures of one colour; one pixel of a million that
+is one level brighter has more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,8 +191,7 @@ def _warp_score(pairs: Mapping[Pair, Correspondence], clear: Images, edited: Ima
     return WarpScore(
         absolute=math.fsum(map(_absolute, after)) / len(after),
         ratio=error,
-        # A picture of one colour has no contrast to be steady with.
-        ratio_per_contrast=error / contrast if contrast > 0 else math.nan,
+        ratio_per_contrast=error / contrast if contrast > NO_CONTRAST else math.nan,
         pairs=len(after),
     )
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from dataclasses import replace
+import re
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
@@ -20,17 +21,18 @@ from benchmarks.editors import (
     compare,
     encoder_of,
     first_keys,
+    heading,
+    line,
     measured,
     moments_of,
     pictures_of,
     scene_of,
     sheet,
-    table,
 )
 from weather_aug.clip.types import FrameKey
 from weather_aug.edit.background import STYLES, BackgroundEditor
 from weather_aug.edit.diffusion.editor import effective_weights
-from weather_aug.edit.diffusion.options import AttentionWeights, DiffusionOptions
+from weather_aug.edit.diffusion.options import DiffusionOptions
 from weather_aug.edit.diffusion.spec import CLEAR, PROMPTS
 from weather_aug.errors import ArgumentError, DataError
 from weather_aug.render.options import EFFECTS, RenderOptions
@@ -88,7 +90,7 @@ def given(*words):
 def test_each_attention_has_its_weights(attention, weights):
     chosen, without = ATTENTION[attention]
     found = effective_weights(DiffusionOptions(attention=chosen, without=without))
-    assert found == AttentionWeights(*map(pytest.approx, weights))
+    assert astuple(found) == pytest.approx(weights)
 
 
 def options_of(row):
@@ -224,14 +226,18 @@ def test_clip_scores_are_means_over_the_pictures(bench):
 
 
 def test_the_table_has_a_number_under_each_heading(bench):
-    lines = table({"none": result_of(bench, Unedited()), "darker": result_of(bench, Darker())})
-    heads = lines[0].split()
-    assert len({len(line) for line in lines}) == 1
-    assert all(
-        len(line.split()) == len("".join(lines[0]).replace(" t", "t").replace(" v", "v").split())
-        for line in lines[1:]
-    ), heads
-    assert lines[1].split()[1:3] == ["-", "-"]
+    names = ("none", "darker")
+    head = heading(names)
+    lines = [
+        line(name, result_of(bench, editor), names)
+        for name, editor in zip(names, (Unedited(), Darker()), strict=True)
+    ]
+    assert {len(each) for each in lines} == {len(head)}
+    headings = re.split(r" {2,}", head.strip())
+    assert [len(each.split()) for each in lines] == [len(headings)] * 2
+    assert lines[0].split()[:3] == ["none", "-", "-"]
+    ratio = result_of(bench, Darker()).scores.warp_view.ratio
+    assert float(lines[1].split()[headings.index("warp v") + 1]) == pytest.approx(ratio, abs=1e-4)
 
 
 class Failing:

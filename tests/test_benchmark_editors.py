@@ -325,13 +325,13 @@ def test_diffusion_and_clip_have_their_numbers(scene, tmp_path, capsys):
             *(str(scene.path), "--frames", "2", "--out", str(tmp_path / "out")),
             *("--clip", str(build_tiny_clip(tmp_path / "clip")), "--editor", "none", "diffusion"),
             *("--base", str(base), "--adapter", str(adapter), "--height", "24"),
-            *("--attention", "self", "release", "--without", "labels"),
+            *("--attention", "release", "--without", "labels"),
         ]
     )
     said = capsys.readouterr().out
     written = json.loads((tmp_path / "out" / "tiny-snow.json").read_text(encoding="utf-8"))
     results = written["results"]
-    names = ["none", "diffusion, self", "diffusion, release", "diffusion, self w/o labels"]
+    names = ["none", "diffusion, release", "diffusion, release w/o labels"]
     assert list(results) == names
     assert all(name in said for name in names)
     assert "CLIP-S     cosine of picture and prompt" in said

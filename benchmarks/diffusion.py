@@ -118,14 +118,15 @@ def train(width: int, height: int) -> None:
     }
     before = _peak_gib()
     start, busy_s = time.perf_counter(), time.process_time()
-    losses = paired_losses(model, batch, PairedWeights(), None, torch.Generator())
+    losses = paired_losses(model, batch, PairedWeights(perceptual=0), None, torch.Generator())
     torch.stack(list(losses.values())).sum().backward()
     optimiser.step()
     learnt = sum(p.numel() for p in model.trained().values()) / 1e6
     _say(
         f"train {width}x{height}: {time.perf_counter() - start:.1f} s a step, "
-        f"{time.process_time() - busy_s:.1f} s of processor, peak {_peak_gib():.1f} GiB ({before:.1f} before; {learnt:.0f} M learnt in four sets of "
-        "rank 128, one acts; batch 1, float32, recomputed activations)"
+        f"{time.process_time() - busy_s:.1f} s of processor, peak {_peak_gib():.1f} GiB "
+        f"({before:.1f} before; {learnt:.0f} M learnt in four sets of rank 128, one acts; batch 1, "
+        "float32, recomputed activations)"
     )
 
 

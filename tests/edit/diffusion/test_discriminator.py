@@ -116,7 +116,7 @@ def test_each_style_has_its_own_and_seeds_decide() -> None:
 
 @pytest.mark.parametrize(("kind", "styles"), [("vgg", ["snow"]), ("patch", []), ("patch", "aa")])
 def test_wrong_choices_are_named(kind: Any, styles: Any) -> None:
-    with pytest.raises(ArgumentError, match="discriminator 'vgg'|styles must name"):
+    with pytest.raises(ArgumentError, match=r"discriminator 'vgg'|styles must name"):
         make_discriminators(kind, styles)
 
 

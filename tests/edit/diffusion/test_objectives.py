@@ -113,7 +113,7 @@ def cycle(judges: Discriminators) -> Run:
 
 @pytest.mark.parametrize("kind", [PairedWeights, EpsilonWeights, CycleWeights])
 def test_weights_are_checked(kind: Any) -> None:
-    with pytest.raises(ArgumentError, match="epsilon|cycle_l1"):
+    with pytest.raises(ArgumentError, match=r"epsilon|cycle_l1"):
         kind(-1.0)
     with pytest.raises(ArgumentError, match="nothing to lower"):
         kind(**dict.fromkeys(kind.__dataclass_fields__, 0.0))

@@ -137,13 +137,13 @@ def test_equal_pictures_are_not_apart_and_a_black_one_has_a_gradient(vae: Any) -
 def test_names(vae: Any) -> None:
     assert perceptual_distance("none", vae) is None
     assert isinstance(perceptual_distance("vae", vae), VaeFeatures)
-    with pytest.raises(ArgumentError, match="vgg.*vae, lpips, none"):
+    with pytest.raises(ArgumentError, match=r"vgg.*vae, lpips, none"):
         perceptual_distance("vgg", vae)  # type: ignore[arg-type]
 
 
 def test_lpips_that_is_not_installed_is_named(vae: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "lpips", None)
-    with pytest.raises(MissingExtraError, match="pip install lpips.*'vae'"):
+    with pytest.raises(MissingExtraError, match=r"pip install lpips.*'vae'"):
         perceptual_distance("lpips", vae)
 
 

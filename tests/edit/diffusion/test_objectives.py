@@ -62,12 +62,12 @@ def judges() -> Discriminators:
 
 
 def a_batch(style: str = "snow", **changes: Any) -> dict[str, Any]:
-    images, labels = pictures(2, 16, 16)
+    images, labels = pictures(4, 16, 16)
     batch = {
-        "source": images[:1].double(),
-        "target": images[1:].double() * 0.5,
-        "source_label": labels[:1],
-        "target_label": labels[1:],
+        "source": images[:2].double(),
+        "target": images[2:].double() * 0.5,
+        "source_label": labels[:2],
+        "target_label": labels[2:],
         "style": style,
         "aligned": True,
     }
@@ -137,9 +137,11 @@ class TestPaired:
                 latent = model.latent_of(encoded.latent, model.noise(encoded.latent, prompt))
             image = model(batch["source"], batch["source_label"], "snow")
             error = (latent - base_latent(model, batch["target"])).square().mean()
-        assert float(found["epsilon"]) == pytest.approx(float(error), rel=1e-5)
-        assert float(found["l1"]) == pytest.approx(float((image - batch["target"]).abs().mean()))
-        assert float(found["perceptual"]) == pytest.approx(float(features(image, batch["target"])))
+        assert found["epsilon"].item() == pytest.approx(error.item(), rel=1e-5)
+        assert found["l1"].item() == pytest.approx((image - batch["target"]).abs().mean().item())
+        assert found["perceptual"].item() == pytest.approx(
+            features(image, batch["target"]).mean().item()
+        )
 
     def test_sees_alpha_bar_swapped(
         self, model: AdaptedModel, monkeypatch: pytest.MonkeyPatch
@@ -159,7 +161,7 @@ class TestPaired:
         features = VaeFeatures(model.vae)
         found = paired_losses(model, batch, PairedWeights(epsilon=0), features)
         assert found.keys() == {"l1", "perceptual"}
-        assert max(float(loss) for loss in found.values()) < 1e-9
+        assert max(loss.item() for loss in found.values()) < 1e-9
 
         def exact(latent: torch.Tensor, *_: Any) -> torch.Tensor:
             return objectives.noise_of_latent(latent, wanted, model.base.alpha_bar)
@@ -167,7 +169,7 @@ class TestPaired:
         monkeypatch.setattr(model, "noise", exact)
         found = paired_losses(model, batch, PairedWeights(l1=0, perceptual=0))
         assert found.keys() == {"epsilon"}
-        assert float(found["epsilon"]) < 1e-12
+        assert found["epsilon"].item() < 1e-12
 
     def test_wants_aligned_pairs_and_a_distance(self, model: AdaptedModel) -> None:
         with pytest.raises(ArgumentError, match="needs aligned pairs"):
@@ -198,7 +200,7 @@ class TestEpsilon:
         for seed in range(3):
             found = epsilon_losses(model, batch, EpsilonWeights(), seeded(seed))
             assert found.keys() == {"epsilon"}
-            assert float(found["epsilon"]) < 1e-10
+            assert found["epsilon"].item() < 1e-10
 
     def test_who_knows_the_noise_pays_nothing(
         self, model: AdaptedModel, monkeypatch: pytest.MonkeyPatch
@@ -211,7 +213,7 @@ class TestEpsilon:
         right = torch.Tensor.sqrt
         # Both roots are taken of the schedule's rows: each for the other is a swap.
         monkeypatch.setattr(
-            torch.Tensor, "sqrt", lambda x: right(1 - x) if x.shape == (1, 1, 1, 1) else right(x)
+            torch.Tensor, "sqrt", lambda x: right(1 - x) if x.shape == (2, 1, 1, 1) else right(x)
         )
         noisy: list[torch.Tensor] = []
         monkeypatch.setattr(model, "noise", lambda z, *_: noisy.append(z) or z)
@@ -226,16 +228,17 @@ class TestEpsilon:
         batch, generator = a_batch(), seeded()
         with torch.no_grad():
             z0 = model.encode(batch["target"], batch["target_label"]).latent
-        time = int(torch.randint(1000, (1,), generator=generator))
+        times = torch.randint(1000, (2,), generator=generator).tolist()
         noise = torch.randn(z0.shape, generator=generator).double()
-        bar = float(model.base.alpha_bars[time])
-        return bar**0.5 * z0 + (1 - bar) ** 0.5 * noise
+        bars = [float(model.base.alpha_bars[time]) for time in times]
+        rows = [b**0.5 * z + (1 - b) ** 0.5 * e for b, z, e in zip(bars, z0, noise, strict=True)]
+        return torch.stack(rows)
 
     def test_the_generator_alone_decides(self, model: AdaptedModel) -> None:
         weights, drawn = EpsilonWeights(), torch.random.get_rng_state()
         with torch.no_grad():
             one, same, other = (
-                float(epsilon_losses(model, a_batch(), weights, seeded(s))["epsilon"])
+                epsilon_losses(model, a_batch(), weights, seeded(s))["epsilon"].item()
                 for s in (1, 1, 2)
             )
         assert one == same != other
@@ -333,9 +336,9 @@ class TestCycle:
             same = model(a, of_a, CLEAR), model(b, of_b, "snow")
             wanted = {
                 "cycle_l1": (back[0] - a).abs().mean() + (back[1] - b).abs().mean(),
-                "cycle_perceptual": features(back[0], a) + features(back[1], b),
+                "cycle_perceptual": (features(back[0], a) + features(back[1], b)).mean(),
                 "identity_l1": (same[0] - a).abs().mean() + (same[1] - b).abs().mean(),
-                "identity_perceptual": features(same[0], a) + features(same[1], b),
+                "identity_perceptual": (features(same[0], a) + features(same[1], b)).mean(),
                 "adversarial": generator_loss(judges["snow"](snowy))
                 + generator_loss(judges[CLEAR](cleared)),
             }
@@ -345,10 +348,10 @@ class TestCycle:
             )
         assert found.keys() == wanted.keys()
         for name, loss in found.items():
-            assert float(loss) == pytest.approx(float(wanted[name]), rel=1e-5), name
+            assert loss.item() == pytest.approx(wanted[name].item(), rel=1e-5), name
         for name, loss in judged.items():
-            halves = (float(sides[0][name]) + float(sides[1][name])) / 2
-            assert float(loss) == pytest.approx(halves, rel=1e-5), name
+            halves = (sides[0][name] + sides[1][name]) / 2
+            assert loss.item() == pytest.approx(halves.item(), rel=1e-5), name
 
     def test_parts_add_up_and_so_do_their_gradients(
         self, model: AdaptedModel, judges: Discriminators
@@ -471,5 +474,5 @@ def test_thirty_steps_lower_it(name: str, small_base: Path, judges: Discriminato
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-        found.append(float(loss))
+        found.append(loss.item())
     assert found[-1] < 0.8 * found[0]

@@ -28,7 +28,7 @@ def enable_checkpointing(model: AdaptedModel) -> None:
 
 
 def _styled_checkpoint(block: nn.Module, *inputs: Any) -> Any:
-    layers = [layer for layer in block.modules() if hasattr(layer, "lora_A")]
+    layers: list[Any] = [layer for layer in block.modules() if hasattr(layer, "lora_A")]
     acting = [layer.active_adapters for layer in layers]
 
     def run(*inputs: Any) -> Any:

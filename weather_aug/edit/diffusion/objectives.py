@@ -223,8 +223,7 @@ def generator_losses(
         generator: Not used, nothing is drawn; the other objectives have one.
 
     Returns:
-        By the names of the weights. The peak of memory is that of six passes through the model;
-        `generator_parts` needs two.
+        By the names of the weights. Memory is that of six passes; `generator_parts` needs two.
 
     Raises:
         ArgumentError: If the model has no style "clear", the batch is of it, or a network that a
@@ -248,10 +247,8 @@ def generator_parts(
 ) -> Iterator[Losses]:
     """`generator_losses` in parts that sum to them, one direction of one kind after the other.
 
-    A backward pass for each part before the next is asked for adds up to the same gradients, with
-    the memory of two passes through the model.
-
-    Args, Raises: As `generator_losses`.
+    Backward passes of each part before the next is asked for add up to the same gradients, with
+    the memory of two passes.
     """
     _check_cycle(model, batch, discriminators)
     if weights.adversarial > 0 and discriminators is None:
@@ -333,7 +330,6 @@ def _there_and_back(
     perceptual: PerceptualDistance | None,
     discriminators: Discriminators | None,
 ) -> Losses:
-    """Terms of a picture edited into a style and back again."""
     there, back = ways
     returns = weights.cycle_l1 > 0 or weights.cycle_perceptual > 0
     if not returns and weights.adversarial == 0:
@@ -371,7 +367,6 @@ def _compared(
 
 
 def _given(perceptual: PerceptualDistance | None, weight: float) -> PerceptualDistance | None:
-    """The distance if its weight asks for it."""
     if weight == 0:
         return None
     if perceptual is None:

@@ -212,5 +212,5 @@ def test_clip_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pytest.Mon
         make_discriminators("clip", ["snow"], clip=tmp_path)
     (tmp_path / "config.json").write_text("{}")
     (tmp_path / "model.safetensors").write_bytes(b"no tensors")
-    with pytest.raises(DataError, match="no CLIP model that can be read"):
+    with pytest.raises(DataError, match="no model that can be read"):
         load_clip(tmp_path)

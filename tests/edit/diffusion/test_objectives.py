@@ -293,17 +293,6 @@ class TestGradients:
         with pytest.raises(AssertionError):
             self.check(model, paired, "snow")
 
-    def test_a_set_that_was_frozen_again_is_seen(
-        self, model: AdaptedModel, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        def frozen(model: AdaptedModel, *styles: str) -> None:
-            for name in sets_of(model, *styles):
-                model.get_parameter(name).requires_grad_(False)
-
-        monkeypatch.setattr(objectives, "_open", frozen)
-        with pytest.raises(AssertionError):
-            self.check(model, paired, "snow")
-
     def test_discriminators_learn_alone(self, model: AdaptedModel, judges: Discriminators) -> None:
         self.check_discriminators(model, judges)
 

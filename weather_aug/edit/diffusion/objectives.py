@@ -8,9 +8,7 @@ Convention:
 
     A loss function returns terms without weights, each a mean over the batch, by the names of the
     fields of its weights; a term of weight 0 is not computed. `weighted_sum` is what to lower.
-    Every function leaves the sets of the styles it used open to gradients until styles are
-    switched again, because autograd drops at the backward pass what is frozen by then: call
-    `backward` before anything else. Nothing draws from a stream of torch's own.
+    Nothing draws from a stream of torch's own.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ import torch
 from torch.nn import functional
 
 from weather_aug._checks import finite
-from weather_aug.edit.diffusion.adapted import SET, AdaptedModel
+from weather_aug.edit.diffusion.adapted import AdaptedModel
 from weather_aug.edit.diffusion.discriminator import (
     Discriminators,
     discriminator_loss,
@@ -154,7 +152,6 @@ def paired_losses(
             losses["l1"] = functional.l1_loss(image.float(), target.float())
         if perceptual is not None:
             losses["perceptual"] = perceptual(image, target).mean()
-    _open(model, style)
     return losses
 
 
@@ -193,7 +190,6 @@ def epsilon_losses(
     if weights.latent > 0:
         wanted = base_latent(model, target)
         losses["latent"] = functional.mse_loss(latent.float(), wanted.float())
-    _open(model, style)
     return losses
 
 
@@ -233,7 +229,6 @@ def generator_losses(
     for part in generator_parts(model, batch, weights, perceptual, discriminators, generator):
         for name, loss in part.items():
             losses[name] = losses[name] + loss if name in losses else loss
-    _open(model, batch["style"], CLEAR)
     return losses
 
 
@@ -261,13 +256,11 @@ def generator_parts(
             model, image, label, (there, back), weights, perceptual, discriminators
         )
         if cycle:
-            _open(model, there, back)
             yield cycle
     if weights.identity_l1 > 0 or weights.identity_perceptual > 0:
         for _, own, image, label in _directions(batch):
             pair = weights.identity_l1, weights.identity_perceptual
             part = _compared("identity", model(image, label, own), image, pair, perceptual)
-            _open(model, own)
             yield part
 
 
@@ -390,11 +383,3 @@ def _check_cycle(model: AdaptedModel, batch: Batch, discriminators: Discriminato
                 f"a cycle needs the style {printable(name)!r}, of the adapter and with a "
                 "discriminator; add it or train with paired or epsilon"
             )
-
-
-def _open(model: AdaptedModel, *styles: str) -> None:
-    """Let gradients into the sets of styles that may not act any more; see the Convention."""
-    names = [f".{SET.format(style)}." for style in styles]
-    for name, parameter in model.trained().items():
-        if any(part in name for part in names):
-            parameter.requires_grad_(True)

@@ -76,6 +76,8 @@ class DiffusionOptions:
     """Of torch."""
     half: bool = False
     """float16 for the networks, on CUDA only."""
+    other_base: bool = False
+    """Take a base with other weights than the adapter was trained on, of the same shape."""
 
     def __post_init__(self) -> None:
         for name in self.without:

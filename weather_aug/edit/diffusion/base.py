@@ -1,0 +1,146 @@
+"""The frozen base model: SD-Turbo, or one of its shape, from a folder in the diffusers layout."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from weather_aug._extras import require
+from weather_aug.edit.diffusion.one_step import LAST_STEP
+from weather_aug.edit.weights import digest_of, is_model_id, located
+from weather_aug.errors import DataError, printable
+
+PARTS = ("unet", "vae", "text_encoder", "tokenizer", "scheduler")
+WHAT = "the one-step diffusion model"
+TO = "edit backgrounds by diffusion"
+
+
+@dataclass(frozen=True, eq=False)
+class Base:
+    """A one-step text-to-image model, frozen.
+
+    Convention:
+        Weights are those of the files, on the CPU in float32; nothing changes them. Files are
+        safetensors only: nothing is unpickled.
+    """
+
+    name: str
+    """Id or the folder's name."""
+    revision: str
+    """The hub's commit where the folder tells it, else ""."""
+    digest: str
+    """Of all files that are read: two bases with the same are the same."""
+    folder: Path
+    unet: Any
+    """UNet2DConditionModel."""
+    vae: Any
+    """AutoencoderKL."""
+    alpha_bars: torch.Tensor
+    """(1000,) float64 cumulative products of the training schedule."""
+
+    @property
+    def alpha_bar(self) -> float:
+        """At the last time step, where one-step models start."""
+        return float(self.alpha_bars[LAST_STEP])
+
+    @property
+    def factor(self) -> int:
+        """Pixels of a picture's side for one of the latent's."""
+        return 2 ** (len(self.vae.config.block_out_channels) - 1)
+
+    def embed(self, prompts: Sequence[str]) -> torch.Tensor:
+        """(N, tokens, width) of the text encoder, which is read for this and let go.
+
+        Raises:
+            DataError: If the text encoder's files cannot be read.
+        """
+        transformers = require("transformers", extra="edit", to=TO)
+        with _readable(self.folder):
+            tokenizer = transformers.CLIPTokenizer.from_pretrained(
+                self.folder / "tokenizer", local_files_only=True
+            )
+            encoder = transformers.CLIPTextModel.from_pretrained(
+                self.folder / "text_encoder", local_files_only=True, use_safetensors=True
+            )
+        tokens = tokenizer(
+            list(prompts),
+            padding="max_length",
+            max_length=tokenizer.model_max_length,
+            truncation=True,
+            return_tensors="pt",
+        )
+        with torch.inference_mode():
+            hidden = encoder.eval()(tokens.input_ids)[0]
+        # Inference tensors cannot take part in training.
+        return hidden.clone()
+
+
+def load_base(base: str) -> Base:
+    """Read a base model.
+
+    Args:
+        base: Folder in the diffusers layout, or an id that is in the local cache.
+
+    Raises:
+        MissingExtraError: If diffusers is not installed.
+        DataError: If it is not there, which says how to fetch it, or its files are no such model.
+    """
+    diffusers = require("diffusers", extra="edit", to=TO)
+    needs = [f"{part}/config.json" for part in ("unet", "vae", "text_encoder")]
+    folder = located(base, to=TO, what=WHAT, needs=[*needs, "scheduler/scheduler_config.json"])
+    with _readable(folder):
+        unet = diffusers.UNet2DConditionModel.from_pretrained(
+            folder / "unet", local_files_only=True, use_safetensors=True
+        )
+        vae = diffusers.AutoencoderKL.from_pretrained(
+            folder / "vae", local_files_only=True, use_safetensors=True
+        )
+        schedule = diffusers.DDPMScheduler.from_pretrained(
+            folder / "scheduler", local_files_only=True
+        )
+    _check(folder, unet, vae, schedule)
+    return Base(
+        name=base if is_model_id(base) and not Path(base).is_dir() else folder.name,
+        revision=folder.name if folder.parent.name == "snapshots" else "",
+        digest=digest_of(folder, PARTS),
+        folder=folder,
+        unet=unet.eval().requires_grad_(False),
+        vae=vae.eval().requires_grad_(False),
+        alpha_bars=schedule.alphas_cumprod.double(),
+    )
+
+
+def _check(folder: Path, unet: Any, vae: Any, schedule: Any) -> None:
+    kind = schedule.config.prediction_type
+    if kind != "epsilon":
+        raise DataError(
+            f"{printable(folder, 200)}: its scheduler says prediction_type {printable(kind)!r}; "
+            "only models that predict the noise (epsilon), such as SD-Turbo, can be used"
+        )
+    if len(schedule.alphas_cumprod) != LAST_STEP + 1:
+        raise DataError(f"{printable(folder, 200)}: its schedule has not {LAST_STEP + 1} steps")
+    latent = vae.config.latent_channels
+    if (unet.config.in_channels, unet.config.out_channels) != (latent, latent):
+        raise DataError(
+            f"{printable(folder, 200)}: the UNet maps {unet.config.in_channels} channels to "
+            f"{unet.config.out_channels}, the VAE's latent has {latent}; they are not of one model"
+        )
+
+
+@contextmanager
+def _readable(folder: Path) -> Iterator[None]:
+    """What the libraries raise on files that are not theirs, as one typed sentence."""
+    try:
+        yield
+    except DataError:
+        raise
+    except Exception as error:
+        raise DataError(
+            f"{printable(folder, 200)} is no model that can be read: "
+            f"{type(error).__name__} {printable(error, 300)}"
+        ) from error

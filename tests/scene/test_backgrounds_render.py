@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -379,8 +380,6 @@ def test_no_editing_leaves_particles_and_air_alone(unedited: WeatherScene) -> No
 def test_a_data_set_draws_over_backgrounds(scene: WeatherScene) -> None:
     dataset = WeatherDataset([scene], WeatherPolicy(types={"snow": 1}), seed=1, crop=(24, 32))
     item = dataset[2]
-    import json
-
     shot = render_recipe(scene, json.loads(item["recipe"]))
     assert (item["image"].permute(1, 2, 0).numpy() == shot.image).all()
 

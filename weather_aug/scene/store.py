@@ -63,7 +63,7 @@ FORMAT = "weather_aug scene"
 VERSION = 1
 MANIFEST = "scene.json"
 MAX_FRAMES = 20_000
-MAX_MANIFEST_BYTES = 96 * 2**20
+MAX_MANIFEST_BYTES = 112 * 2**20
 """More than MAX_FRAMES entries of the longest names take, so that what is built can be opened."""
 
 _DEPTH, _LABEL, _COVER = "<f2", "|u1", "<f4"

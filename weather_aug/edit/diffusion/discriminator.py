@@ -14,7 +14,7 @@ from torch.nn.utils.parametrizations import spectral_norm
 from weather_aug._extras import require
 from weather_aug._keys import key_of
 from weather_aug.edit.diffusion.adapted import SET
-from weather_aug.edit.weights import located
+from weather_aug.edit.weights import located, readable
 from weather_aug.errors import ArgumentError, printable
 
 DiscriminatorKind = Literal["patch", "clip"]

@@ -16,7 +16,7 @@ from tiny_clip_model import build_tiny_clip
 from tiny_diffusion import build_tiny_sd
 
 from benchmarks import editor_rows, editors
-from benchmarks.editor_rows import ATTENTION, Physical, Row, Unedited, peer_options, rows_of
+from benchmarks.editor_rows import ATTENTION, Physical, Row, peer_options, rows_of
 from benchmarks.editors import (
     FirstTimes,
     arguments,
@@ -41,6 +41,7 @@ from weather_aug.edit.diffusion.base import load_base
 from weather_aug.edit.diffusion.editor import effective_weights
 from weather_aug.edit.diffusion.options import DiffusionOptions
 from weather_aug.edit.diffusion.spec import CLEAR, PROMPTS, AdapterSpec
+from weather_aug.edit.editors import Unedited
 from weather_aug.errors import ArgumentError, DataError
 from weather_aug.render.options import EFFECTS, RenderOptions
 from weather_aug.scene.scene import WeatherScene

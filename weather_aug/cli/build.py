@@ -22,7 +22,7 @@ class Build:
     """Scene folder to make."""
     editor: str = "physical"
     """How backgrounds get their weather: physical (while rendering), diffusion, instruct-pix2pix,
-    controlnet, turboedit, stylisation, snow-cover, or none."""
+    controlnet, turboedit, stylisation, colour-transfer, snow-cover, or none."""
     weathers: tuple[str, ...] | None = None
     """Types the scene is meant for, and that another editor than physical edits to; all that it
     knows if not given."""
@@ -39,7 +39,7 @@ class Build:
     weights: Path | None = None
     """Folder of the networks of stylisation."""
     pictures: Path | None = None
-    """Folder with a picture of each weather, for stylisation."""
+    """Folder with a picture of each weather, for stylisation and colour-transfer."""
     edit_height: int | None = None
     """Rows at which pictures are edited, their aspect kept; their own if not given."""
     device: str | None = None
@@ -138,7 +138,7 @@ _EDITORS_BY_FLAG = {
     "without": ("diffusion",),
     "control": ("controlnet",),
     "weights": ("stylisation",),
-    "pictures": ("stylisation",),
+    "pictures": ("stylisation", "colour-transfer"),
     "edit_height": _NETWORKS,
     "device": _NETWORKS,
 }

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from weather_aug.clip.types import Clip
 from weather_aug.edit.background import STYLES, BackgroundEditor, Moment
 from weather_aug.errors import ArgumentError, printable
 
@@ -31,8 +32,11 @@ _HOMES = {
     "controlnet": _Home("peers.controlnet", "ControlNet", *_PEER),
     "turboedit": _Home("peers.turboedit", "TurboEdit", *_PEER),
     "stylisation": _Home("peers.stylisation", "Stylisation", *_PEER),
+    "colour-transfer": _Home("peers.colour_transfer", "ColourTransfer", *_PEER),
     "snow-cover": _Home("peers.snow_cover", "SnowCover", *_PEER),
 }
+_MEASURE = ("colour-transfer",)
+"""Editors that look at the clip before they edit it."""
 EDITORS = (*_HOMES, "none")
 """Names of editors that store backgrounds; the physical editor needs none."""
 
@@ -62,13 +66,14 @@ class Unedited:
         return tuple(frame.image.copy() for frame in moment.now)
 
 
-def editor_of(name: str, options: Any = None) -> BackgroundEditor:
+def editor_of(name: str, options: Any = None, clip: Clip | None = None) -> BackgroundEditor:
     """Load an editor.
 
     Args:
         name: One of `EDITORS`.
         options: `edit.diffusion.options.DiffusionOptions` of "diffusion", nothing of "none",
             `edit.peers.options.PeerOptions` of all others; the defaults if None.
+        clip: That will be edited; needed by "colour-transfer", which measures it.
 
     Raises:
         ArgumentError: If there is no such editor, or it has other options.
@@ -91,7 +96,8 @@ def editor_of(name: str, options: Any = None) -> BackgroundEditor:
             f"{type(options).__name__}"
         )
     editor = getattr(_module(home.module), home.name)
-    loaded: BackgroundEditor = editor.load(takes() if options is None else options)
+    given = (takes() if options is None else options,)
+    loaded: BackgroundEditor = editor.load(*given, *((clip,) if name in _MEASURE else ()))
     return loaded
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from weather_aug import _files
 from weather_aug._png import png_bytes
-from weather_aug.clip.types import Frame
+from weather_aug.clip.types import Clip, Frame
 from weather_aug.edit.ambience import Ambience
 from weather_aug.edit.background import STYLES, BackgroundEditor, Moment
 from weather_aug.edit.editors import editor_of
@@ -41,7 +41,7 @@ class Editing(NamedTuple):
 
 
 def editing_of(
-    editor: str | BackgroundEditor, options: Any, weathers: Sequence[str] | None
+    editor: str | BackgroundEditor, options: Any, weathers: Sequence[str] | None, clip: Clip
 ) -> Editing | None:
     """Checked choices; None for the physical editor, which edits while rendering.
 
@@ -49,6 +49,7 @@ def editing_of(
         editor: One, or the name of one in `edit.editors.EDITORS`, or "physical".
         options: Of an editor that is named.
         weathers: Types the backgrounds are to be edited to; all that the editor knows if None.
+        clip: To be edited.
 
     Raises:
         ArgumentError: If there is no such editor, it cannot edit to a weather, or is none; if
@@ -57,7 +58,7 @@ def editing_of(
         MissingExtraError: If a package that it needs is not installed.
     """
     if isinstance(editor, str) and editor != PHYSICAL:
-        editor = editor_of(editor, options)
+        editor = editor_of(editor, options, clip)
     elif options is not None:
         raise ArgumentError(
             "editor_options are for editors that are named, and the physical editor has none; "

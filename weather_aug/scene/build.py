@@ -102,7 +102,7 @@ def build(
         raise ClipError(
             f"clip {clip.name} is of unrelated pictures; only a drive can be reconstructed"
         )
-    editing = editing_of(editor, editor_options, weathers)
+    editing = editing_of(editor, editor_options, weathers, clip)
     if weathers is None:
         weathers = STYLES if editing is None else editing.styles
     out = publish.located(out)

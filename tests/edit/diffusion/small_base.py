@@ -25,7 +25,9 @@ def perturbed(model: AdaptedModel, seed: int) -> AdaptedModel:
     return model
 
 
-def pictures(count: int = 1, height: int = 32, width: int = 48) -> tuple[torch.Tensor, torch.Tensor]:
+def pictures(
+    count: int = 1, height: int = 32, width: int = 48
+) -> tuple[torch.Tensor, torch.Tensor]:
     """(count, 3, height, width) in [-1, 1] and labels."""
     generator = torch.Generator().manual_seed(11)
     image = torch.rand(count, 3, height, width, generator=generator) * 2 - 1

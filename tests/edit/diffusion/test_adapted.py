@@ -54,9 +54,7 @@ def an_input(layer: Any) -> torch.Tensor:
 @pytest.mark.parametrize(
     "weights", [{"snow": 1.0}, {"snow": 0.5, "rain": 0.3, CLEAR: 0.2}, {"fog": 0.25, CLEAR: 0.75}]
 )
-def test_every_layer_of_the_unet_adds_its_sets(
-    small_base: Path, weights: dict[str, float]
-) -> None:
+def test_every_layer_of_the_unet_adds_its_sets(small_base: Path, weights: dict[str, float]) -> None:
     model = perturbed(adapted(small_base), seed=3).double()
     kinds = set()
     with torch.no_grad(), model.styled(weights):

@@ -69,6 +69,7 @@ class AdaptedModel(nn.Module):
         self.base, self.spec = base, spec
         self.unet, self.vae = base.unet, base.vae
         self.checkpointing = False
+        self.learns = True
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             for style in spec.styles:
@@ -221,15 +222,22 @@ class AdaptedModel(nn.Module):
             for name, parameter in own.items():
                 parameter.copy_(tensors[name])
 
+    def frozen(self) -> AdaptedModel:
+        """The same model, which from now on only draws."""
+        self.learns = False
+        self._activate(self._active)
+        return self.eval()
+
     def _activate(self, weights: Mapping[str, float]) -> None:
         self._active = dict(weights)
         active = [SET.format(style) for style in weights]
         self.unet.set_adapters(active, list(weights.values()))
         for name, parameter in self.trained().items():
             if name.startswith("unet.") and ".lora_" in name:
-                parameter.requires_grad_(any(f".{name_of}." in name for name_of in active))
+                chosen = any(f".{name_of}." in name for name_of in active)
+                parameter.requires_grad_(self.learns and chosen)
             else:
-                parameter.requires_grad_(True)
+                parameter.requires_grad_(self.learns)
 
 
 def _add_low_rank(network: Any, name: str, targets: Sequence[str], rank: int, alpha: float) -> None:

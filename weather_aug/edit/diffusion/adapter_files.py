@@ -148,7 +148,7 @@ def load_adapter(folder: Path, base: Base, *, other_base: bool = False) -> Adapt
         )
     model = AdaptedModel(base, card.spec)
     model.load_trained(_weights(folder, card))
-    return model.eval().requires_grad_(False)
+    return model.frozen()
 
 
 def _weights(folder: Path, card: Card) -> dict[str, torch.Tensor]:

@@ -32,6 +32,15 @@ OPTIONS = TrainOptions(
 STYLES = ("rain", "snow")
 
 
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """Of torch: threads that wait for each other make small sums slow."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(scope="module")
 def pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_pair_folder(tmp_path_factory.mktemp("pairs") / "list", train=2, styles=STYLES)

@@ -347,17 +347,17 @@ def keep_less(model: AdaptedModel) -> None:
     """Let a model compute activations again for the gradient instead of keeping them."""
 
     def checkpointed(module: Any, *args: Any) -> Any:
-        # The gradient may be computed when other styles act than did at first.
         acting = dict(model._active)
 
         def run(*inputs: Any) -> Any:
-            if model._active == acting:
-                return module(*inputs)
-            with model.styled(acting):
-                out = module(*inputs)
-            for parameter in model.trained().values():
-                parameter.requires_grad_(True)
-            return out
+            if model._active != acting:
+                # Gradients are computed when other styles act than did at first. What acts now
+                # stays: the next block backwards is most often of the same pass. Switching freezes
+                # sets whose gradients are still to come, so all are opened again.
+                model._activate(acting)
+                for parameter in model.trained().values():
+                    parameter.requires_grad_(True)
+            return module(*inputs)
 
         return checkpoint(run, *args, use_reentrant=False)
 

@@ -1,4 +1,4 @@
-"""The command line: build | render | sweep | export | view | inspect | demo."""
+"""The command line: demo, build, render, sweep, export, view, inspect, list-pairs, train-editor."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ from tyro.conf import Positional
 
 from weather_aug import __version__, _files
 from weather_aug.cli.build import Build
+from weather_aug.cli.pairs import ListPairs
 from weather_aug.cli.render import Render
 from weather_aug.cli.terminal import check_folder, complain, say, to_people
+from weather_aug.cli.train import TrainEditor
 from weather_aug.cli.view import View
 from weather_aug.errors import (
     ArgumentError,
@@ -197,6 +199,8 @@ Command = (
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Inspect, tyro.conf.subcommand("inspect")]
+    | Annotated[ListPairs, tyro.conf.subcommand("list-pairs")]
+    | Annotated[TrainEditor, tyro.conf.subcommand("train-editor")]
 )
 
 
@@ -218,7 +222,7 @@ def main(arguments: list[str] | None = None) -> None:
         complain(str(error))
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
-        goes_on = isinstance(command, Build | Export)
+        goes_on = isinstance(command, Build | Export | TrainEditor)
         cure = "; run the same command again to continue" if goes_on else ""
         complain(f"interrupted{cure}")
         sys.exit(130)

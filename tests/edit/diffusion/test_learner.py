@@ -150,7 +150,7 @@ def test_that_test_sees_the_wrong_style_in_the_way_back(
             lambda module, *args: checkpoint(module, *args, use_reentrant=False)
         )
 
-    monkeypatch.setattr(learner_module, "keep_less", unaware)
+    monkeypatch.setattr(learner_module, "enable_checkpointing", unaware)
     try:
         kept, again = both_gradients(small_base, pairs, options)
     except torch.utils.checkpoint.CheckpointError:

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch
 from torch.nn import functional
@@ -33,6 +34,9 @@ from weather_aug.edit.diffusion.perceptual import BaseEncoder, PerceptualDistanc
 from weather_aug.edit.diffusion.skips import encode
 from weather_aug.edit.diffusion.spec import CLEAR
 from weather_aug.errors import ArgumentError, printable
+
+# Of each model one: making it costs as much as a small picture's encoding.
+_BASE_ENCODERS: WeakKeyDictionary[AdaptedModel, BaseEncoder] = WeakKeyDictionary()
 
 Batch = Mapping[str, Any]
 Losses = dict[str, torch.Tensor]
@@ -298,8 +302,10 @@ def discriminator_losses(
 
 def base_latent(model: AdaptedModel, image: torch.Tensor) -> torch.Tensor:
     """(B, 4, h, w) of (B, 3, H, W) by the base's own encoder: no adapter, label or gradient."""
+    if model not in _BASE_ENCODERS:
+        _BASE_ENCODERS[model] = BaseEncoder(model.vae)
     with torch.no_grad():
-        return encode(BaseEncoder(model.vae), image).latent
+        return encode(_BASE_ENCODERS[model], image).latent
 
 
 def _directions(batch: Batch) -> tuple[tuple[str, str, torch.Tensor, torch.Tensor], ...]:

@@ -11,6 +11,7 @@ import torch
 
 from weather_aug._extras import require
 from weather_aug.edit.diffusion.one_step import LAST_STEP
+from weather_aug.edit.loading import quiet_libraries, read_network
 from weather_aug.edit.weights import digest_of, is_model_id, located, readable
 from weather_aug.errors import DataError, printable
 
@@ -59,13 +60,11 @@ class Base:
             DataError: If the text encoder's files cannot be read.
         """
         transformers = require("transformers", extra="edit", to=TO)
-        with readable(self.folder):
+        with readable(self.folder), quiet_libraries():
             tokenizer = transformers.CLIPTokenizer.from_pretrained(
                 self.folder / "tokenizer", local_files_only=True
             )
-            encoder = transformers.CLIPTextModel.from_pretrained(
-                self.folder / "text_encoder", local_files_only=True, use_safetensors=True
-            )
+        encoder = read_network(transformers.CLIPTextModel, self.folder / "text_encoder")
         tokens = tokenizer(
             list(prompts),
             padding="max_length",
@@ -92,13 +91,9 @@ def load_base(base: str) -> Base:
     diffusers = require("diffusers", extra="edit", to=TO)
     needs = [f"{part}/config.json" for part in ("unet", "vae", "text_encoder")]
     folder = located(base, to=TO, what=WHAT, needs=[*needs, "scheduler/scheduler_config.json"])
-    with readable(folder):
-        unet = diffusers.UNet2DConditionModel.from_pretrained(
-            folder / "unet", local_files_only=True, use_safetensors=True
-        )
-        vae = diffusers.AutoencoderKL.from_pretrained(
-            folder / "vae", local_files_only=True, use_safetensors=True
-        )
+    unet = read_network(diffusers.UNet2DConditionModel, folder / "unet")
+    vae = read_network(diffusers.AutoencoderKL, folder / "vae")
+    with readable(folder), quiet_libraries():
         schedule = diffusers.DDPMScheduler.from_pretrained(
             folder / "scheduler", local_files_only=True
         )

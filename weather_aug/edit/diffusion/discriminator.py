@@ -14,7 +14,8 @@ from torch.nn.utils.parametrizations import spectral_norm
 from weather_aug._extras import require
 from weather_aug._keys import key_of
 from weather_aug.edit.diffusion.adapted import SET
-from weather_aug.edit.weights import located, readable
+from weather_aug.edit.loading import read_network
+from weather_aug.edit.weights import located
 from weather_aug.errors import ArgumentError, printable
 
 DiscriminatorKind = Literal["patch", "clip"]
@@ -178,10 +179,7 @@ def load_clip(source: str | Path) -> Any:
     transformers = require("transformers", extra="edit", to=TO)
     what = "the CLIP model of the discriminators"
     folder = located(source, to=TO, what=what, needs=("config.json", "model.safetensors"))
-    with readable(folder):
-        model = transformers.CLIPVisionModel.from_pretrained(
-            folder, local_files_only=True, use_safetensors=True
-        )
+    model = read_network(transformers.CLIPVisionModel, folder)
     return model.eval().requires_grad_(False)
 
 

@@ -22,6 +22,7 @@ from weather_aug.edit.diffusion.base import load_base
 from weather_aug.edit.diffusion.options import AttentionWeights, DiffusionOptions
 from weather_aug.edit.diffusion.references import view_references, window_links
 from weather_aug.edit.diffusion.skips import Encoded
+from weather_aug.edit.loading import device_of
 from weather_aug.errors import ArgumentError, DataError, printable
 from weather_aug.taxonomy import IGNORE
 
@@ -60,7 +61,7 @@ class DiffusionEditor:
                 style in each subfolder of a style's name.
 
         Raises:
-            ArgumentError: If no adapter is given.
+            ArgumentError: If no adapter is given, or torch has no such device.
             DataError: If base or adapter cannot be read or do not belong together.
             IntegrityError: If the adapter's weights are not those that it was saved with.
             MissingExtraError: If diffusers or peft are not installed.
@@ -79,6 +80,7 @@ class DiffusionEditor:
 
     @classmethod
     def _of(cls, folder: Path, options: DiffusionOptions) -> DiffusionEditor:
+        device_of(options.device)
         card = read_card(folder)
         model = load_adapter(folder, load_base(options.base), other_base=options.other_base)
         return cls(model, options, card)

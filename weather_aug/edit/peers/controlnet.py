@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from weather_aug._extras import require
 from weather_aug.clip.types import Frame
 from weather_aug.edit.background import Moment
+from weather_aug.edit.loading import read_network
 from weather_aug.edit.peers.conditions import PUBLISHED, condition_of
 from weather_aug.edit.peers.draws import generator_of
 from weather_aug.edit.peers.instruct import unit_tensor
@@ -24,7 +25,7 @@ from weather_aug.edit.peers.pipelines import (
     precision_of,
     quiet,
 )
-from weather_aug.edit.weights import digest_of, located, readable
+from weather_aug.edit.weights import digest_of, located
 from weather_aug.errors import ArgumentError, DataError, printable
 
 UInt8 = NDArray[np.uint8]
@@ -147,13 +148,7 @@ class ControlNet:
 
 def _read(folder: Path, options: PeerOptions) -> Any:
     diffusers = require("diffusers", extra="edit", to=_TO)
-    with readable(folder):
-        return diffusers.ControlNetModel.from_pretrained(
-            folder,
-            local_files_only=True,
-            use_safetensors=True,
-            dtype=precision_of(options),
-        )
+    return read_network(diffusers.ControlNetModel, folder, dtype=precision_of(options))
 
 
 def _check(unet: Any, net: Any, folder: Path, control: Path) -> None:

@@ -153,3 +153,13 @@ def test_render_takes_a_stored_style(scene: WeatherScene, tmp_path: Path) -> Non
         )
         shot = scene.render(key, Weather.snow("heavy"), **choices)
         assert (cv2.imread(str(tmp_path / f"{key}.png"))[..., ::-1] == shot.image).all(), flags
+
+
+def test_an_occupied_place_is_told_before_networks_are_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "out").mkdir()
+    words = ["build", "street:?seed=3&frames=1&width=64&height=48", "--out", str(tmp_path / "out")]
+    with pytest.raises(SystemExit):
+        main([*words, "--editor", "diffusion", "--base", "nowhere", "--adapter", "nowhere"])
+    assert "exists; choose another folder" in capsys.readouterr().err

@@ -140,7 +140,7 @@ _EDITORS_BY_FLAG = {
     "weights": ("stylisation",),
     "pictures": ("stylisation", "colour-transfer"),
     "edit_height": _NETWORKS,
-    "device": _NETWORKS,
+    "device": _MODELS,
 }
 """Which editors a flag means something to."""
 

@@ -102,6 +102,8 @@ def build(
         raise ClipError(
             f"clip {clip.name} is of unrelated pictures; only a drive can be reconstructed"
         )
+    # Before networks are read, which takes a while.
+    publish.check_free(publish.located(out), overwrite)
     editing = editing_of(editor, editor_options, weathers, clip)
     if weathers is None:
         weathers = STYLES if editing is None else editing.styles

@@ -308,11 +308,16 @@ def _inspect_scene(path: Path) -> list[str]:
 def _named(card: Mapping[str, Any]) -> str:
     """What an editor's card says in so many words, for people: texts and numbers, not lists."""
     told = [
-        f"{printable(name)} {printable(value)}"
+        f"{printable(name)} {printable(_shortened(name, value))}"
         for name, value in card.items()
-        if isinstance(value, str | int | float) and name != "editor"
+        if isinstance(value, str | int | float) and value != "" and name != "editor"
     ]
     return f" ({', '.join(told)})" if told else ""
+
+
+def _shortened(name: str, value: object) -> object:
+    is_digest = isinstance(value, str) and name.endswith(("digest", "sha256", "revision"))
+    return str(value)[:12] if is_digest else value
 
 
 def _state(recipe: str) -> str:

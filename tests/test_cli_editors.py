@@ -42,7 +42,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> WeatherScene:
 class Asked(list[tuple[str, Any]]):
     """What `editor_of` is asked for; it gives a small editor of that name."""
 
-    def __call__(self, name: str, options: Any) -> Tinting:
+    def __call__(self, name: str, options: Any, clip: Any) -> Tinting:
         self.append((name, options))
         return Tinting(name=name)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -27,6 +29,9 @@ from weather_aug.taxonomy import IGNORE
 
 UInt8 = NDArray[np.uint8]
 
+LATENTS_KEPT = 32
+"""By their pixels: more than three times of six cameras, a few MB."""
+
 
 class DiffusionEditor:
     """A `BackgroundEditor` on a one-step diffusion model and an adapter for all weathers.
@@ -50,6 +55,7 @@ class DiffusionEditor:
         dtype = torch.float16 if options.half else torch.float32
         self.model = model.to(options.device, dtype)
         self.attention = effective_weights(options)
+        self._latents: OrderedDict[bytes, torch.Tensor] = OrderedDict()
 
     @classmethod
     def load(cls, options: DiffusionOptions) -> DiffusionEditor | SingleStyleEditors:
@@ -122,16 +128,16 @@ class DiffusionEditor:
             DataError: If the cameras' pictures have different sizes and are to look at each other.
         """
         window = self._window(moment)
-        frames = [frame for frames in window for frame in frames]
-        first_now = len(window[0])
         with torch.inference_mode(), self.model.styled(style) as prompt:
-            encoded = [self._encoded(frame) for frame in frames]
+            latents = [self._latent(frame) for frames in window for frame in frames]
             ahead = None if moment.look is None else moment.look(moment.now[0])[1].axes_world[0]
-            noises = self._noises([one.latent for one in encoded], prompt, window, ahead)
+            first = len(window[0])
+            noises = self._noises(latents, prompt, window, ahead)[first:]
             edited = []
-            for index, frame in enumerate(moment.now, start=first_now):
-                one = encoded[index]
-                latent = self.model.latent_of(one.latent, noises[index])
+            for frame, noise in zip(moment.now, noises, strict=False):
+                # Again, since the skips of a whole rig would take gigabytes.
+                one = self._encoded(frame)
+                latent = self.model.latent_of(one.latent, noise)
                 edited.append(self._picture(self.model.decode(latent, one.skips), frame))
         return tuple(edited)
 
@@ -162,6 +168,16 @@ class DiffusionEditor:
         batch = _stacked(latents, [frame for frames in window for frame in frames])
         with temporal_view(self.model.unet, links, self.attention):
             return self.model.noise(batch, prompt).split(1)
+
+    def _latent(self, frame: Frame) -> torch.Tensor:
+        """Kept for a while: it is asked for again in every style and at the next time."""
+        key = _digest_of(frame)
+        if key not in self._latents:
+            self._latents[key] = self._encoded(frame).latent
+        self._latents.move_to_end(key)
+        while len(self._latents) > LATENTS_KEPT:
+            self._latents.popitem(last=False)
+        return self._latents[key]
 
     def _encoded(self, frame: Frame) -> Encoded:
         height, width = self._size(frame)
@@ -249,6 +265,14 @@ def effective_weights(options: DiffusionOptions) -> AttentionWeights:
     if (view, before, after) != (given.view, given.before, given.after):
         itself = max(itself, 1 - view - before - after)
     return AttentionWeights(itself, view, before, after)
+
+
+def _digest_of(frame: Frame) -> bytes:
+    digest = hashlib.blake2b(repr(frame.image.shape).encode(), digest_size=16)
+    for array in (frame.image, frame.label):
+        if array is not None:
+            digest.update(memoryview(np.ascontiguousarray(array)))
+    return digest.digest()
 
 
 def _stacked(latents: Sequence[torch.Tensor], frames: Sequence[Frame]) -> torch.Tensor:

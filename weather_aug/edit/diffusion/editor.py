@@ -271,7 +271,7 @@ def _digest_of(frame: Frame) -> bytes:
     digest = hashlib.blake2b(repr(frame.image.shape).encode(), digest_size=16)
     for array in (frame.image, frame.label):
         if array is not None:
-            digest.update(memoryview(np.ascontiguousarray(array)))
+            digest.update(array.tobytes())
     return digest.digest()
 
 

@@ -1,0 +1,316 @@
+"""What learns: an adapter, in "cycle" discriminators too, their optimisers, and one step of both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import nn
+from torch.utils.checkpoint import checkpoint
+
+from weather_aug._extras import require
+from weather_aug._keys import key_of
+from weather_aug.edit.diffusion.adapted import AdaptedModel
+from weather_aug.edit.diffusion.base import Base
+from weather_aug.edit.diffusion.objectives import (
+    CycleWeights,
+    Losses,
+    discriminator_losses,
+    epsilon_losses,
+    generator_parts,
+    paired_losses,
+    weighted_sum,
+)
+from weather_aug.edit.diffusion.perceptual import perceptual_distance
+from weather_aug.edit.diffusion.spec import CLEAR
+from weather_aug.edit.diffusion.train_options import BETAS, WEIGHT_DECAY, TrainOptions
+from weather_aug.edit.diffusion.train_state import (
+    State,
+    load_optimiser,
+    optimiser_state,
+    prefixed,
+    under,
+)
+from weather_aug.errors import ArgumentError, DataError, MissingExtraError, printable
+
+ADAPTER, DISCRIMINATOR = "adapter", "discriminator"
+SEED_MASK = 2**63 - 1
+
+Batch = Mapping[str, Any]
+
+
+class Part(NamedTuple):
+    """Some terms of a loss, and what to lower of them."""
+
+    losses: Losses
+    total: torch.Tensor
+
+
+class Update(NamedTuple):
+    """One change of a player's parameters."""
+
+    player: str
+    parts: Callable[[Batch, torch.Generator], Iterator[Part]]
+    """Terms that add up, each to be lowered before the next is asked for."""
+
+
+class Player(NamedTuple):
+    """Parameters and their optimiser."""
+
+    parameters: dict[str, nn.Parameter]
+    optimiser: Any
+    learning_rate: float
+
+
+class Learner:
+    """An adapter in training.
+
+    Convention:
+        The optimiser holds the parameters of all styles. Those that a step does not use have no
+        gradient, not one of zero: neither moments nor weight decay move them.
+
+    Args:
+        base: Used up.
+        styles: That there are pairs of; "cycle" adds "clear", its way back.
+        options: How to train.
+        accelerator: Of accelerate, with the options' precision and parts.
+    """
+
+    def __init__(
+        self, base: Base, styles: Sequence[str], options: TrainOptions, accelerator: Any
+    ) -> None:
+        self.options, self.accelerator = options, accelerator
+        if options.objective == "cycle":
+            styles = (CLEAR, *(style for style in styles if style != CLEAR))
+        spec = options.spec(tuple(styles))
+        self.model = AdaptedModel(base, spec, seed=_key("train.adapter", options.seed))
+        self.model.to(accelerator.device)
+        if options.gradient_checkpointing:
+            keep_less(self.model)
+        self.perceptual = None
+        if options.objective != "epsilon":
+            self.perceptual = perceptual_distance(
+                options.perceptual, self.model.vae, checkpointing=options.gradient_checkpointing
+            )
+            if isinstance(self.perceptual, nn.Module):
+                self.perceptual.to(accelerator.device)
+        self.players = {ADAPTER: self._player(self.model.trained(), options.learning_rate)}
+        self.discriminators = None
+        self.updates = tuple(self._updates())
+
+    def step(self, step: int, batch: Batch) -> dict[str, Any]:
+        """Learn from a batch.
+
+        Args:
+            step: From 0 on.
+            batch: Of one style; see `objectives`.
+
+        Returns:
+            JSON values for the log: number of steps done, style, share of the learning rate, norm
+            of the adapter's gradient before it is clipped (the largest of the step's updates), and
+            the losses without weights.
+
+        Raises:
+            ArgumentError: If a loss or a gradient is no number any more.
+        """
+        losses: dict[str, float] = {}
+        norms: dict[str, float] = {}
+        batch = self._placed(batch)
+        share = self.options.learning_rate_share(step)
+        for player in self.players.values():
+            for group in player.optimiser.param_groups:
+                group["lr"] = player.learning_rate * share
+        for number, update in enumerate(self.updates):
+            found, norm = self._updated(update, batch, (step, number))
+            losses |= found
+            norms[update.player] = max(norm, norms.get(update.player, 0.0))
+            self._check(step, batch["style"], {**losses, "gradient": norm})
+        return {
+            "step": step + 1,
+            "style": batch["style"],
+            "learning_rate": self.options.learning_rate * share,
+            "gradient": norms[ADAPTER],
+            "losses": losses,
+        }
+
+    def judged(self, batch: Batch, *fields: int) -> dict[str, float]:
+        """Losses of a batch without weights, learning nothing; draws are keyed by `fields`."""
+        losses: dict[str, float] = {}
+        batch = self._placed(batch)
+        with torch.no_grad():
+            for number, update in enumerate(self.updates):
+                generator = _generator("train.judged", self.options.seed, *fields, number)
+                with self.accelerator.autocast():
+                    for part in update.parts(batch, generator):
+                        _add(losses, part.losses, 1)
+        return losses
+
+    def state(self, step: int) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+        """Head and tensors that `load` goes on from."""
+        tensors: dict[str, torch.Tensor] = {}
+        values: dict[str, Any] = {}
+        for name, player in self.players.items():
+            known, numbers = optimiser_state(player.optimiser, tuple(player.parameters))
+            tensors |= prefixed(f"{name}.parameter", player.parameters)
+            tensors |= prefixed(f"{name}.moment", known)
+            values |= prefixed(f"{name}.moment", numbers)
+        scaler = self.accelerator.scaler
+        scale = None if scaler is None else scaler.state_dict()
+        return {"step": step, "values": values, "scaler": scale}, tensors
+
+    def load(self, state: State) -> None:
+        """Take the state of another learner of the same options.
+
+        Raises:
+            DataError: If it is of another one.
+        """
+        try:
+            for name, player in self.players.items():
+                saved = under(f"{name}.parameter", state.tensors)
+                with torch.no_grad():
+                    for key, parameter in player.parameters.items():
+                        parameter.copy_(saved[key])
+                load_optimiser(
+                    player.optimiser,
+                    tuple(player.parameters),
+                    under(f"{name}.moment", state.tensors),
+                    under(f"{name}.moment", state.head["values"]),
+                )
+            if state.head["scaler"] is not None:
+                self.accelerator.scaler.load_state_dict(state.head["scaler"])
+        except (KeyError, RuntimeError, AttributeError, TypeError) as error:
+            raise DataError(
+                f"the state of the unfinished training does not fit ({printable(error)}); restart "
+                "(--restart) to train anew"
+            ) from None
+
+    def _updates(self) -> Iterator[Update]:
+        """What is done in each step, in this order."""
+        model, options = self.model, self.options
+        if options.objective == "paired":
+
+            def paired(batch: Batch, generator: torch.Generator) -> Iterator[Part]:
+                weights = options.paired
+                losses = paired_losses(model, batch, weights, self.perceptual, generator)
+                yield Part(losses, weighted_sum(losses, weights))
+
+            yield Update(ADAPTER, paired)
+        elif options.objective == "epsilon":
+
+            def epsilon(batch: Batch, generator: torch.Generator) -> Iterator[Part]:
+                losses = epsilon_losses(model, batch, options.epsilon, generator)
+                yield Part(losses, weighted_sum(losses, options.epsilon))
+
+            yield Update(ADAPTER, epsilon)
+
+    def _updated(
+        self, update: Update, batch: Batch, fields: tuple[int, ...]
+    ) -> tuple[dict[str, float], float]:
+        """Change a player's parameters; its losses, and the norm of its gradient."""
+        player = self.players[update.player]
+        parts = self.options.accumulate
+        losses: dict[str, float] = {}
+        for number, micro in enumerate(split(batch, parts)):
+            generator = _generator("train.noise", self.options.seed, *fields, number)
+            # Divides what is lowered by the number of parts.
+            with self.accelerator.accumulate():
+                found = update.parts(micro, generator)
+                while True:
+                    with self.accelerator.autocast():
+                        part = next(found, None)
+                    if part is None:
+                        break
+                    self.accelerator.backward(part.total)
+                    _add(losses, part.losses, parts)
+        self.accelerator.unscale_gradients(player.optimiser)
+        norm = nn.utils.clip_grad_norm_(player.parameters.values(), self.options.clip)
+        player.optimiser.step()
+        for other in self.players.values():
+            other.optimiser.zero_grad()
+        return losses, float(norm)
+
+    def _placed(self, batch: Batch) -> dict[str, Any]:
+        """The batch on the device."""
+        device = self.accelerator.device
+        return {
+            name: value.to(device) if isinstance(value, torch.Tensor) else value
+            for name, value in batch.items()
+        }
+
+    def _player(self, parameters: dict[str, nn.Parameter], learning_rate: float) -> Player:
+        make = torch.optim.AdamW
+        if self.options.optimiser == "adamw8bit":
+            make = _eight_bit()
+        optimiser = make(
+            list(parameters.values()), lr=learning_rate, betas=BETAS, weight_decay=WEIGHT_DECAY
+        )
+        return Player(parameters, self.accelerator.prepare(optimiser), learning_rate)
+
+    def _check(self, step: int, style: str, numbers: Mapping[str, float]) -> None:
+        # Half precision overflows now and then; its scaler leaves such a step out.
+        scaled = self.accelerator.scaler is not None
+        for name, value in numbers.items():
+            if not torch.tensor(value).isfinite() and not (scaled and name == "gradient"):
+                raise ArgumentError(
+                    f"{name} of step {step + 1} ({style}) is {value}; training came off its way: "
+                    f"take a learning_rate below {self.options.learning_rate:g}, or "
+                    'mixed_precision "no"'
+                )
+
+
+def keep_less(model: AdaptedModel) -> None:
+    """Let a model compute activations again for the gradient instead of keeping them."""
+
+    def checkpointed(module: Any, *args: Any) -> Any:
+        # The gradient may be computed when other styles act than did at first.
+        acting = dict(model._active)
+
+        def run(*inputs: Any) -> Any:
+            if model._active == acting:
+                return module(*inputs)
+            with model.styled(acting):
+                out = module(*inputs)
+            for parameter in model.trained().values():
+                parameter.requires_grad_(True)
+            return out
+
+        return checkpoint(run, *args, use_reentrant=False)
+
+    model.checkpointing = True
+    model.unet.enable_gradient_checkpointing(checkpointed)
+
+
+def split(batch: Batch, parts: int) -> Iterator[dict[str, Any]]:
+    """Equal parts of a batch, in its order."""
+    count = len(batch["source"]) // parts
+    for first in range(0, count * parts, count):
+        yield {
+            name: value[first : first + count] if isinstance(value, torch.Tensor) else value
+            for name, value in batch.items()
+        }
+
+
+def _add(sums: dict[str, float], losses: Losses, parts: int) -> None:
+    for name, loss in losses.items():
+        sums[name] = sums.get(name, 0.0) + float(loss.detach()) / parts
+
+
+def _key(domain: str, *fields: int) -> int:
+    return key_of(domain, *fields) & SEED_MASK
+
+
+def _generator(domain: str, *fields: int) -> torch.Generator:
+    """A stream on the CPU that depends on the key alone."""
+    return torch.Generator().manual_seed(_key(domain, *fields))
+
+
+def _eight_bit() -> Any:
+    try:
+        return require("bitsandbytes", extra="edit", to="train").optim.AdamW8bit
+    except MissingExtraError as error:
+        raise MissingExtraError(
+            'bitsandbytes is needed for the optimiser "adamw8bit"; install it with: pip install '
+            'bitsandbytes, or take optimiser "adamw"'
+        ) from error.__cause__

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from weather_aug._extras import require
@@ -132,3 +133,21 @@ def _cached(model_id: str, to: str, what: str) -> Path:
         return Path(hub.snapshot_download(model_id, local_files_only=True))
     except (hub.errors.LocalEntryNotFoundError, hub.errors.HFValidationError) as error:
         raise missing_weights(model_id, licence_of(model_id), what) from error
+
+
+@contextmanager
+def readable(folder: Path) -> Iterator[None]:
+    """What the libraries raise on files that are not theirs, as one typed sentence.
+
+    Raises:
+        DataError: If anything goes wrong within the block.
+    """
+    try:
+        yield
+    except DataError:
+        raise
+    except Exception as error:
+        raise DataError(
+            f"{printable(folder, 200)} is no model that can be read: "
+            f"{type(error).__name__} {printable(error, 300)}"
+        ) from error

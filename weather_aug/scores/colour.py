@@ -27,7 +27,7 @@ Mask = NDArray[np.bool_]
 Kind = Literal["joint", "channels"]
 
 BINS = 8
-"""By channel: 8 x 8 x 8 bins are the usual choice for a joint histogram of RGB; with many more, bins
+"""By channel: 8 x 8 x 8 bins are the usual choice for a joint histogram; with many more, bins
 hold a pixel or two, and all pictures are far apart."""
 MOST_BINS = 256
 _TOLERANCE = 1e-9

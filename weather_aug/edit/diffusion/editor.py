@@ -126,14 +126,12 @@ class DiffusionEditor:
         first_now = len(window[0])
         with torch.inference_mode(), self.model.styled(style) as prompt:
             encoded = [self._encoded(frame) for frame in frames]
-            latents = _stacked([one.latent for one in encoded], frames)
-            noise = self._noise(latents, prompt, window)
+            noises = self._noises([one.latent for one in encoded], prompt, window)
             edited = []
             for index, frame in enumerate(moment.now, start=first_now):
                 one = encoded[index]
-                latent = self.model.latent_of(one.latent, noise[index : index + 1])
-                out = self.model.decode(latent, one.skips)
-                edited.append(self._picture(out, frame))
+                latent = self.model.latent_of(one.latent, noises[index])
+                edited.append(self._picture(self.model.decode(latent, one.skips), frame))
         return tuple(edited)
 
     def _window(self, moment: Moment) -> tuple[Sequence[Frame], Sequence[Frame], Sequence[Frame]]:
@@ -144,20 +142,24 @@ class DiffusionEditor:
         seen = [[f for f in frames if f.key.camera in names] for frames in (before, after)]
         return seen[0], moment.now, seen[1]
 
-    def _noise(
-        self, latents: torch.Tensor, prompt: torch.Tensor, window: Sequence[Sequence[Frame]]
-    ) -> torch.Tensor:
+    def _noises(
+        self,
+        latents: Sequence[torch.Tensor],
+        prompt: torch.Tensor,
+        window: Sequence[Sequence[Frame]],
+    ) -> Sequence[torch.Tensor]:
+        """Predictions for the (1, 4, h, w) latents of all frames of a window."""
         now = window[1]
-        looks_around = self.attention.view or self.attention.before or self.attention.after
-        if not looks_around:
+        if not (self.attention.view or self.attention.before or self.attention.after):
             # One at a time: pictures that do not see each other need no common memory.
-            return torch.cat([self.model.noise(one[None], prompt) for one in latents])
+            return [self.model.noise(latent, prompt) for latent in latents]
         cameras = [frame.key.camera for frame in now]
         references = view_references([frame.camera for frame in now])
         reference_of = {camera: cameras[at] for camera, at in zip(cameras, references, strict=True)}
         links = window_links([[f.key.camera for f in frames] for frames in window], reference_of)
+        batch = _stacked(latents, [frame for frames in window for frame in frames])
         with temporal_view(self.model.unet, links, self.attention):
-            return self.model.noise(latents, prompt)
+            return self.model.noise(batch, prompt).split(1)
 
     def _encoded(self, frame: Frame) -> Encoded:
         height, width = self._size(frame)

@@ -21,6 +21,9 @@ from weather_aug.clip.images import read_image
 from weather_aug.edit.diffusion.one_step import LAST_STEP, latent_of_noise
 from weather_aug.edit.diffusion.spec import PROMPTS
 
+ARRIVED, ARRIVED_COPY = 0.05, 0.5
+"""Weights of the squared error of the latent that one step arrives at, from noise and from a
+copy."""
 CARD = "model_card.json"
 NOTE = (
     "A small stand-in of SD-Turbo's shape, pre-trained on procedural streets by "
@@ -42,8 +45,12 @@ class Schedule:
     unet_rate: float = 1e-3
     divergence: float = 1e-4
     """Weight of the VAE's KL term, per number of the latent."""
-    one_step: float = 0.25
+    one_step: float = 0.125
     """Share of the UNet's items that start from pure noise."""
+    copied: float = 0.25
+    """Share of the UNet's items that see at the last time step, in place of noise, the very latent
+    that they are to arrive at: what one-step editing starts from. SD-Turbo can copy by its size;
+    a small model has to practise it, as the step enlarges its errors fifteen times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,25 +146,34 @@ def train_unet(
     tokens = _tokens(parts, [PROMPTS[style] for style in PROMPTS])
     rows = torch.tensor([list(PROMPTS).index(style) for style in styles])
     trained = [parts.unet, parts.text_encoder]
-    recent = 0.0
+    recent = copy = 0.0
+    copies = torch.tensor(0.0)
     for step, optimiser in _steps(trained, schedule.unet_steps, schedule.unet_rate):
         chosen = torch.randint(len(latents), (schedule.batch,), generator=generator)
         clean = _mirrored(latents[chosen], generator)
         times = torch.randint(LAST_STEP + 1, (schedule.batch,), generator=generator)
-        once = torch.rand(schedule.batch, generator=generator) < schedule.one_step
+        draw = torch.rand(schedule.batch, generator=generator)
+        once = draw < schedule.one_step + schedule.copied
+        copied = draw < schedule.copied
         times = torch.where(once, LAST_STEP, times)
         noise = torch.randn(clean.shape, generator=generator)
         share = alpha_bars[times][:, None, None, None].float()
         seen = share.sqrt() * clean + (1 - share).sqrt() * noise
+        seen = torch.where(copied[:, None, None, None], clean, seen)
+        noise = (seen - share.sqrt() * clean) / (1 - share).sqrt()
         hidden = parts.text_encoder(tokens)[0][rows[chosen]]
         found = parts.unet(seen, times, encoder_hidden_states=hidden).sample
         loss = error = functional.mse_loss(found, noise)
         if once.any():
-            at_once = latent_of_noise(seen[once], found[once], alpha_bar)
-            loss = loss + 0.02 * functional.mse_loss(at_once, clean[once])
+            off = latent_of_noise(seen[once], found[once], alpha_bar) - clean[once]
+            weight = torch.where(copied[once], ARRIVED_COPY, ARRIVED)[:, None, None, None]
+            loss = loss + (weight * off.square()).mean() * once.sum() / schedule.batch
+            copies = (off.square().mean((1, 2, 3)) * copied[once]).sum() / copied.sum().clamp(min=1)
         _descend(loss, optimiser, trained)
         recent += 0.02 * (error.item() - recent) if step else error.item()
-        _report("unet", step, schedule.unet_steps, f"noise MSE {recent:.4f}")
+        copy += 0.05 * (copies.item() - copy)
+        text = f"noise MSE {recent:.4f}, latent MSE of a copy {copy:.4f}"
+        _report("unet", step, schedule.unet_steps, text)
     return recent
 
 

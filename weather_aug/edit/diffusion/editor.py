@@ -126,7 +126,8 @@ class DiffusionEditor:
         first_now = len(window[0])
         with torch.inference_mode(), self.model.styled(style) as prompt:
             encoded = [self._encoded(frame) for frame in frames]
-            noises = self._noises([one.latent for one in encoded], prompt, window)
+            ahead = None if moment.look is None else moment.look(moment.now[0])[1].axes_world[0]
+            noises = self._noises([one.latent for one in encoded], prompt, window, ahead)
             edited = []
             for index, frame in enumerate(moment.now, start=first_now):
                 one = encoded[index]
@@ -147,6 +148,7 @@ class DiffusionEditor:
         latents: Sequence[torch.Tensor],
         prompt: torch.Tensor,
         window: Sequence[Sequence[Frame]],
+        ahead_world: NDArray[np.float64] | None,
     ) -> Sequence[torch.Tensor]:
         """Predictions for the (1, 4, h, w) latents of all frames of a window."""
         now = window[1]
@@ -154,7 +156,7 @@ class DiffusionEditor:
             # One at a time: pictures that do not see each other need no common memory.
             return [self.model.noise(latent, prompt) for latent in latents]
         cameras = [frame.key.camera for frame in now]
-        references = view_references([frame.camera for frame in now])
+        references = view_references([frame.camera for frame in now], ahead_world)
         reference_of = {camera: cameras[at] for camera, at in zip(cameras, references, strict=True)}
         links = window_links([[f.key.camera for f in frames] for frames in window], reference_of)
         batch = _stacked(latents, [frame for frames in window for frame in frames])

@@ -1,9 +1,10 @@
-"""What learns: an adapter, in "cycle" discriminators too, their optimisers, and one step of both."""
+"""What learns: an adapter, for cycles discriminators as well, their optimisers, and one step."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from contextlib import contextmanager
+from dataclasses import asdict
 from typing import Any, NamedTuple
 
 import torch
@@ -14,6 +15,7 @@ from weather_aug._extras import require
 from weather_aug._keys import key_of
 from weather_aug.edit.diffusion.adapted import AdaptedModel
 from weather_aug.edit.diffusion.base import Base
+from weather_aug.edit.diffusion.discriminator import Discriminators, make_discriminators
 from weather_aug.edit.diffusion.objectives import (
     CycleWeights,
     Losses,
@@ -25,6 +27,7 @@ from weather_aug.edit.diffusion.objectives import (
 )
 from weather_aug.edit.diffusion.perceptual import perceptual_distance
 from weather_aug.edit.diffusion.spec import CLEAR
+from weather_aug.edit.diffusion.train_batches import split
 from weather_aug.edit.diffusion.train_options import BETAS, WEIGHT_DECAY, TrainOptions
 from weather_aug.edit.diffusion.train_state import (
     State,
@@ -37,6 +40,12 @@ from weather_aug.errors import ArgumentError, DataError, MissingExtraError, prin
 
 ADAPTER, DISCRIMINATOR = "adapter", "discriminator"
 SEED_MASK = 2**63 - 1
+CYCLE_UPDATES = (
+    ("cycle_l1", "cycle_perceptual"),
+    ("adversarial",),
+    ("identity_l1", "identity_perceptual"),
+)
+"""Terms of each of the adapter's updates in one step with cycles, in the release's order."""
 
 Batch = Mapping[str, Any]
 
@@ -48,12 +57,15 @@ class Part(NamedTuple):
     total: torch.Tensor
 
 
+Parts = Callable[[Batch, torch.Generator], Iterator[Part]]
+"""Terms that add up, each to be lowered before the next is asked for."""
+
+
 class Update(NamedTuple):
     """One change of a player's parameters."""
 
     player: str
-    parts: Callable[[Batch, torch.Generator], Iterator[Part]]
-    """Terms that add up, each to be lowered before the next is asked for."""
+    parts: Parts
 
 
 class Player(NamedTuple):
@@ -62,6 +74,16 @@ class Player(NamedTuple):
     parameters: dict[str, nn.Parameter]
     optimiser: Any
     learning_rate: float
+    network: nn.Module | None = None
+    """Whose buffers belong to what is learnt; None if it has none."""
+
+    @property
+    def buffers(self) -> dict[str, torch.Tensor]:
+        """Estimates that go on with every pass, such as those of spectral norms."""
+        if self.network is None:
+            return {}
+        known = self.network.state_dict()
+        return {name: known[name] for name in known if name not in self.parameters}
 
 
 class Learner:
@@ -97,8 +119,23 @@ class Learner:
             if isinstance(self.perceptual, nn.Module):
                 self.perceptual.to(accelerator.device)
         self.players = {ADAPTER: self._player(self.model.trained(), options.learning_rate)}
-        self.discriminators = None
-        self.updates = tuple(self._updates())
+        self.discriminators: Discriminators | None = None
+        if options.objective == "cycle":
+            self.discriminators = make_discriminators(
+                options.discriminator,
+                spec.styles,
+                clip=options.clip_model,
+                seed=options.seed,
+            ).to(accelerator.device)
+            learnt = {
+                name: parameter
+                for name, parameter in self.discriminators.named_parameters()
+                if parameter.requires_grad
+            }
+            self.players[DISCRIMINATOR] = self._player(
+                learnt, options.discriminator_learning_rate, self.discriminators
+            )
+        self.updates = self._updates()
 
     def step(self, step: int, batch: Batch) -> dict[str, Any]:
         """Learn from a batch.
@@ -139,13 +176,25 @@ class Learner:
         """Losses of a batch without weights, learning nothing; draws are keyed by `fields`."""
         losses: dict[str, float] = {}
         batch = self._placed(batch)
-        with torch.no_grad():
+        with torch.no_grad(), self._still():
             for number, update in enumerate(self.updates):
                 generator = _generator("train.judged", self.options.seed, *fields, number)
                 with self.accelerator.autocast():
                     for part in update.parts(batch, generator):
                         _add(losses, part.losses, 1)
         return losses
+
+    @contextmanager
+    def _still(self) -> Iterator[None]:
+        """Inside the block the discriminators' estimates stay as they are."""
+        networks = [player.network for player in self.players.values() if player.network]
+        for network in networks:
+            network.eval()
+        try:
+            yield
+        finally:
+            for network in networks:
+                network.train()
 
     def state(self, step: int) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
         """Head and tensors that `load` goes on from."""
@@ -154,6 +203,7 @@ class Learner:
         for name, player in self.players.items():
             known, numbers = optimiser_state(player.optimiser, tuple(player.parameters))
             tensors |= prefixed(f"{name}.parameter", player.parameters)
+            tensors |= prefixed(f"{name}.buffer", player.buffers)
             tensors |= prefixed(f"{name}.moment", known)
             values |= prefixed(f"{name}.moment", numbers)
         scaler = self.accelerator.scaler
@@ -169,9 +219,10 @@ class Learner:
         try:
             for name, player in self.players.items():
                 saved = under(f"{name}.parameter", state.tensors)
+                saved |= under(f"{name}.buffer", state.tensors)
                 with torch.no_grad():
-                    for key, parameter in player.parameters.items():
-                        parameter.copy_(saved[key])
+                    for key, tensor in {**player.parameters, **player.buffers}.items():
+                        tensor.copy_(saved[key])
                 load_optimiser(
                     player.optimiser,
                     tuple(player.parameters),
@@ -186,24 +237,51 @@ class Learner:
                 "(--restart) to train anew"
             ) from None
 
-    def _updates(self) -> Iterator[Update]:
+    def _updates(self) -> tuple[Update, ...]:
         """What is done in each step, in this order."""
         model, options = self.model, self.options
-        if options.objective == "paired":
 
-            def paired(batch: Batch, generator: torch.Generator) -> Iterator[Part]:
-                weights = options.paired
-                losses = paired_losses(model, batch, weights, self.perceptual, generator)
+        def paired(batch: Batch, generator: torch.Generator) -> Iterator[Part]:
+            losses = paired_losses(model, batch, options.paired, self.perceptual, generator)
+            yield Part(losses, weighted_sum(losses, options.paired))
+
+        def epsilon(batch: Batch, generator: torch.Generator) -> Iterator[Part]:
+            losses = epsilon_losses(model, batch, options.epsilon, generator)
+            yield Part(losses, weighted_sum(losses, options.epsilon))
+
+        if options.objective == "paired":
+            return (Update(ADAPTER, paired),)
+        if options.objective == "epsilon":
+            return (Update(ADAPTER, epsilon),)
+        return tuple(self._cycle_updates())
+
+    def _cycle_updates(self) -> Iterator[Update]:
+        """The release's: the adapter three times, then the discriminators twice."""
+        weights = asdict(self.options.cycle)
+        for terms in CYCLE_UPDATES:
+            chosen = {name: weights[name] if name in terms else 0.0 for name in weights}
+            if any(chosen.values()):
+                yield Update(ADAPTER, self._generator_update(CycleWeights(**chosen)))
+        if weights["adversarial"] > 0:
+            yield Update(DISCRIMINATOR, self._discriminator_update("fake"))
+            yield Update(DISCRIMINATOR, self._discriminator_update("real"))
+
+    def _generator_update(self, weights: CycleWeights) -> Parts:
+        def parts(batch: Batch, generator: torch.Generator) -> Iterator[Part]:
+            for losses in generator_parts(
+                self.model, batch, weights, self.perceptual, self.discriminators, generator
+            ):
                 yield Part(losses, weighted_sum(losses, weights))
 
-            yield Update(ADAPTER, paired)
-        elif options.objective == "epsilon":
+        return parts
 
-            def epsilon(batch: Batch, generator: torch.Generator) -> Iterator[Part]:
-                losses = epsilon_losses(model, batch, options.epsilon, generator)
-                yield Part(losses, weighted_sum(losses, options.epsilon))
+    def _discriminator_update(self, term: str) -> Parts:
+        def parts(batch: Batch, generator: torch.Generator) -> Iterator[Part]:
+            assert self.discriminators is not None
+            loss = discriminator_losses(self.model, batch, self.discriminators, generator)[term]
+            yield Part({term: loss}, loss)
 
-            yield Update(ADAPTER, epsilon)
+        return parts
 
     def _updated(
         self, update: Update, batch: Batch, fields: tuple[int, ...]
@@ -239,14 +317,19 @@ class Learner:
             for name, value in batch.items()
         }
 
-    def _player(self, parameters: dict[str, nn.Parameter], learning_rate: float) -> Player:
+    def _player(
+        self,
+        parameters: dict[str, nn.Parameter],
+        learning_rate: float,
+        network: nn.Module | None = None,
+    ) -> Player:
         make = torch.optim.AdamW
         if self.options.optimiser == "adamw8bit":
             make = _eight_bit()
         optimiser = make(
             list(parameters.values()), lr=learning_rate, betas=BETAS, weight_decay=WEIGHT_DECAY
         )
-        return Player(parameters, self.accelerator.prepare(optimiser), learning_rate)
+        return Player(parameters, self.accelerator.prepare(optimiser), learning_rate, network)
 
     def _check(self, step: int, style: str, numbers: Mapping[str, float]) -> None:
         # Half precision overflows now and then; its scaler leaves such a step out.
@@ -280,16 +363,6 @@ def keep_less(model: AdaptedModel) -> None:
 
     model.checkpointing = True
     model.unet.enable_gradient_checkpointing(checkpointed)
-
-
-def split(batch: Batch, parts: int) -> Iterator[dict[str, Any]]:
-    """Equal parts of a batch, in its order."""
-    count = len(batch["source"]) // parts
-    for first in range(0, count * parts, count):
-        yield {
-            name: value[first : first + count] if isinstance(value, torch.Tensor) else value
-            for name, value in batch.items()
-        }
 
 
 def _add(sums: dict[str, float], losses: Losses, parts: int) -> None:

@@ -2,33 +2,35 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch.utils.data import DataLoader
 from tqdm.auto import tqdm
 
 from weather_aug import _files
 from weather_aug._extras import require
-from weather_aug._keys import key_of, uniforms
 from weather_aug._png import png_bytes
 from weather_aug.edit.diffusion import samples, train_state
 from weather_aug.edit.diffusion.adapter_files import save_adapter
 from weather_aug.edit.diffusion.base import Base, load_base
-from weather_aug.edit.diffusion.leakage import TrainedOn, check_no_leak
+from weather_aug.edit.diffusion.leakage import TrainedOn
 from weather_aug.edit.diffusion.learner import Learner
-from weather_aug.edit.diffusion.pair_data import PairImages, StyleBatches
+from weather_aug.edit.diffusion.pair_data import PairImages
 from weather_aug.edit.diffusion.pairs import PairList, read_pairs
+from weather_aug.edit.diffusion.train_batches import (
+    batches,
+    collated,
+    counts_of,
+    digest_of_pairs,
+)
+from weather_aug.edit.diffusion.train_batches import chosen as chosen_pairs
 from weather_aug.edit.diffusion.train_options import TrainOptions
 from weather_aug.errors import ArgumentError, printable
-from weather_aug.taxonomy import IGNORE
 
 TO = "train an adapter"
 VERSION = 1
@@ -94,14 +96,14 @@ def train_editor(
         OutputError: If the folder cannot be written.
     """
     require("accelerate", extra="edit", to=TO)
-    chosen = _chosen(read_pairs(Path(pairs)), options)
+    chosen = chosen_pairs(read_pairs(Path(pairs)), options)
     with train_state.held(Path(out)) as work, _threads(options.threads):
         loaded = load_base(base)
         _check_size(options, loaded)
         train_state.begin(work, _job(chosen, loaded, options), restart=restart)
         done = 0
         if not train_state.is_finished(work):
-            with _accelerated(options) as accelerator:
+            with accelerated(options) as accelerator:
                 training = _Training(chosen, loaded, work, options, accelerator)
                 done = training.run(progress=progress)
         report = _report(chosen, work, Path(out), done)
@@ -139,7 +141,8 @@ class _Training:
             total=options.steps, initial=done, desc="train", unit="step", disable=not progress
         )
         with bar:
-            for step, batch in enumerate(self._batches(done), start=done):
+            steps = batches(self.pair_list, options, first_step=done)
+            for step, batch in enumerate(steps, start=done):
                 entry = self.learner.step(step, batch)
                 train_state.add_to_log(self.work, entry)
                 bar.set_postfix({"style": batch["style"], **_shown(entry["losses"])})
@@ -147,35 +150,6 @@ class _Training:
                 self._look(step + 1)
         self._write()
         return done
-
-    def _batches(self, first_step: int) -> Iterator[dict[str, Any]]:
-        """The batch of each step that is still to come; see `prepared`."""
-        options = self.options
-        images = PairImages(
-            self.pair_list,
-            options.size,
-            short_side=options.short_side,
-            mirrored=options.mirrored,
-            seed=options.seed,
-        )
-        batches = StyleBatches(
-            self.pair_list,
-            options.batch_size,
-            options.seed,
-            first_step=first_step,
-            steps=options.steps,
-        )
-        loader: DataLoader[dict[str, Any]] = DataLoader(
-            images,
-            batch_sampler=batches,
-            collate_fn=collated,
-            num_workers=options.workers,
-            pin_memory=options.device == "cuda",
-            # Nothing is drawn from it; without one the process's own stream is used up.
-            generator=torch.Generator(),
-        )
-        for step, batch in enumerate(loader, start=first_step):
-            yield without_labels(batch, step, options)
 
     def _look(self, step: int) -> None:
         """What is due after a step: validation, samples, the state on disk."""
@@ -216,8 +190,10 @@ class _Training:
                 continue
             item = PairImages(self.pair_list, self.options.size, split=split, style=style)[0]
             edited = samples.edited(self.learner.model, item["source"], item["source_label"], style)
-            pictures = [samples.picture_of(one) for one in (item["source"], edited, item["target"])]
-            rows.append(samples.Row(style, *pictures, item["aligned"]))
+            clear, shown, target = (
+                samples.picture_of(one) for one in (item["source"], edited, item["target"])
+            )
+            rows.append(samples.Row(style, clear, shown, target, item["aligned"]))
         return samples.grid(rows)
 
     def _write(self) -> None:
@@ -238,70 +214,16 @@ class _Training:
                 "options": options.as_json(),
                 "pair_list": self.pair_list.name,
                 "pairs_sha256": digest_of_pairs(self.pair_list),
-                "pairs": _counts(self.pair_list),
+                "pairs": counts_of(self.pair_list),
                 "validation": validations[-1] if validations else {},
                 "torch": torch.__version__,
             },
         )
 
 
-def collated(items: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """A batch of items of one style.
-
-    Args:
-        items: Of `PairImages`.
-
-    Returns:
-        `source` and `target` (B, 3, H, W) in [-1, 1], `source_label` and `target_label` (B, H, W)
-        train ids, `style`, and `aligned`, whether all are.
-    """
-    tensors = ("source", "target", "source_label", "target_label")
-    batch: dict[str, Any] = {name: torch.stack([item[name] for item in items]) for name in tensors}
-    (style,) = {item["style"] for item in items}
-    return batch | {"style": style, "aligned": all(item["aligned"] for item in items)}
-
-
-def without_labels(batch: Mapping[str, Any], step: int, options: TrainOptions) -> dict[str, Any]:
-    """The batch of a step with some pictures' labels withheld: all of such a label is unknown."""
-    changed = dict(batch)
-    count = len(batch["source"])
-    draws = uniforms(key_of("train.labels", options.seed, step), 2 * count).reshape(2, count)
-    for name, numbers in zip(("source_label", "target_label"), draws, strict=True):
-        withheld = torch.from_numpy(numbers < options.label_dropout)[:, None, None]
-        changed[name] = torch.where(withheld, IGNORE, batch[name])
-    return changed
-
-
-def digest_of_pairs(pair_list: PairList) -> str:
-    """SHA-256 of what the pairs are, wherever their folder stands."""
-    digest = hashlib.sha256()
-    for pair in pair_list.pairs:
-        digest.update(json.dumps(asdict(pair)).encode() + b"\n")
-    return digest.hexdigest()
-
-
 def sample_name(step: int) -> str:
     """Of the grid after a step."""
     return f"step_{step:07d}.png"
-
-
-def _chosen(pair_list: PairList, options: TrainOptions) -> PairList:
-    """The pairs of the styles that are learnt, when it is certain that none leaks."""
-    styles = options.styles or pair_list.selected("train").styles
-    for style in styles:
-        pair_list.selected("train", style)
-    judged = [pair for pair in pair_list.pairs if pair.split != "train" or pair.style in styles]
-    # Of other styles, too: their clear pictures may be the same.
-    check_no_leak(replace(pair_list, pairs=tuple(judged)))
-    kept = tuple(pair for pair in judged if pair.style in styles)
-    unaligned = sum(pair.split == "train" and not pair.aligned for pair in kept)
-    if options.objective == "paired" and unaligned:
-        raise ArgumentError(
-            f"{unaligned} pairs of {printable(pair_list.name)!r} show different places; the "
-            'objective "paired" compares pixels: take "cycle" or "epsilon", or list aligned pairs '
-            "alone"
-        )
-    return replace(pair_list, pairs=kept)
 
 
 def _check_size(options: TrainOptions, base: Base) -> None:
@@ -339,17 +261,11 @@ def _report(pair_list: PairList, work: Path, out: Path, done: int) -> Report:
         folder=out,
         steps=last,
         resumed_at=done,
-        pairs=_counts(pair_list),
+        pairs=counts_of(pair_list),
         losses={name: total / counts[name] for name, total in sums.items()},
         validation=validations[-1] if validations else {},
         sample=out / train_state.SAMPLES / sample_name(last),
     )
-
-
-def _counts(pair_list: PairList) -> dict[str, int]:
-    return {
-        style: count for (style, split), count in pair_list.counts().items() if split == "train"
-    }
 
 
 def _due(step: int, every: int) -> bool:
@@ -373,9 +289,12 @@ def _threads(count: int | None) -> Iterator[None]:
 
 
 @contextmanager
-def _accelerated(options: TrainOptions) -> Iterator[Any]:
-    """An accelerator of its own: its library keeps one state a process, which later callers of
-    another precision would be refused by."""
+def accelerated(options: TrainOptions) -> Iterator[Any]:
+    """An accelerator of its own.
+
+    Its library keeps one state a process, by which later callers with another precision would be
+    refused.
+    """
     accelerate = require("accelerate", extra="edit", to=TO)
     state = require("accelerate.state", extra="edit", to=TO)
     if options.device == "cuda" and not torch.cuda.is_available():

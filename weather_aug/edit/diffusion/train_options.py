@@ -8,6 +8,7 @@ from typing import Any, Literal, get_args
 
 from weather_aug._checks import finite
 from weather_aug._keys import check_seed
+from weather_aug.edit.diffusion.discriminator import CLIP, DiscriminatorKind
 from weather_aug.edit.diffusion.objectives import CycleWeights, EpsilonWeights, PairedWeights
 from weather_aug.edit.diffusion.pairs import PAIR_STYLES
 from weather_aug.edit.diffusion.perceptual import Perceptual
@@ -57,8 +58,11 @@ class TrainOptions:
     perceptual: Perceptual = "vae"
     """Distance of pictures as networks see them: "vae" needs no other weights, "lpips" is the
     release's, "none" goes with weights of 0; see `perceptual`."""
-    discriminator: str | None = None
-    """Of "cycle"; None for the one that needs no other weights; see `discriminator`."""
+    discriminator: DiscriminatorKind = "patch"
+    """Of "cycle", one for each style: "patch" needs no other weights, "clip" is the release's; see
+    `discriminator`."""
+    clip_model: str = CLIP
+    """For discriminator "clip": a folder, or the id of a model in the local cache."""
     learning_rate: float = 5e-6
     """Of AdamW; the release's scripts have 5e-6, its documentation 1e-5. Small models want more."""
     discriminator_learning_rate: float = 5e-6
@@ -168,6 +172,13 @@ class TrainOptions:
                         f"style {printable(style)!r} is not one of {', '.join(PAIR_STYLES)}"
                     )
             object.__setattr__(self, "styles", styles)
+        if self.perceptual == "none":
+            for name, weight in asdict(getattr(self, self.objective)).items():
+                if "perceptual" in name and weight > 0:
+                    raise ArgumentError(
+                        f'perceptual "none" does not go with a weight of {name} of {weight:g}; set '
+                        "it to 0"
+                    )
         if self.device == "cpu" and self.mixed_precision == "fp16":
             raise ArgumentError('mixed_precision "fp16" needs a GPU; on a CPU take "no" or "bf16"')
         if self.device == "cpu" and self.optimiser == "adamw8bit":
@@ -215,6 +226,7 @@ class TrainOptions:
 _CHOICES: dict[str, tuple[str, ...]] = {
     "objective": get_args(Objective),
     "perceptual": get_args(Perceptual),
+    "discriminator": get_args(DiscriminatorKind),
     "optimiser": get_args(Optimiser),
     "mixed_precision": get_args(Precision),
     "device": ("cpu", "cuda"),

@@ -148,7 +148,7 @@ def load(work: Path) -> State | None:
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             head = json.loads(file.metadata()[HEAD])
-            return State(head, {name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
+            return State(head, {name: file.get_tensor(name) for name in file.keys()})
     except Exception as error:
         raise DataError(
             f"{printable(path, 200)} is damaged ({printable(error)}); restart (--restart) to train "

@@ -1,13 +1,13 @@
 """The paper's comparison of background editors, on any clip: one row an editor.
 
-python -m benchmarks.editors CLIP-OR-SCENE --editor none physical snow-cover stylisation
-python -m benchmarks.editors CLIP-OR-SCENE --editor diffusion --base DIR --adapter DIR \
+python -m benchmarks.editors SOURCE --editor none physical snow-cover stylisation
+python -m benchmarks.editors SOURCE --editor diffusion --base DIR --adapter DIR \
     --attention self view temporal release paper --without labels --clip CLIP-MODEL-DIR
-python -m benchmarks.editors CLIP-OR-SCENE --editor stylisation colour-transfer controlnet --peer \
-    stylisation.weights=DIR stylisation.pictures=DIR colour-transfer.pictures=DIR controlnet.base=DIR
+python -m benchmarks.editors SOURCE --editor stylisation colour-transfer controlnet \
+    --weights DIR --pictures DIR --peer controlnet.base=DIR controlnet.steps=20
 
-CLIP is what `weather_aug.open_clip` takes, or the folder of a scene; of a clip a scene is built in
-a temporary folder first. Numbers are of backgrounds as the editor leaves them: nothing falls.
+SOURCE is what `weather_aug.open_clip` takes, or the folder of a scene; of a clip a scene is built
+in a temporary folder first. Numbers are of backgrounds as the editor leaves them: nothing falls.
 """
 
 from __future__ import annotations
@@ -16,35 +16,24 @@ import argparse
 import math
 import tempfile
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.editor_rows import ATTENTION, NONE, PEER_VALUES, PHYSICAL, Physical, Row, rows_of
 from benchmarks.report import write_results
 from weather_aug.clip.open import open_clip
 from weather_aug.clip.types import Clip, Float64, Frame, FrameKey
 from weather_aug.edit.background import STYLES, BackgroundEditor, Moment
-from weather_aug.edit.diffusion.options import (
-    ABLATIONS,
-    RELEASE_WEIGHTS,
-    SD_TURBO,
-    SELF_ONLY,
-    AttentionWeights,
-    DiffusionOptions,
-    paper_weights,
-)
+from weather_aug.edit.diffusion.options import ABLATIONS
 from weather_aug.edit.diffusion.spec import CLEAR, PROMPTS
-from weather_aug.edit.peers.options import PeerOptions
-from weather_aug.edit.physical.edit import edited
 from weather_aug.errors import ArgumentError, DataError, MissingExtraError
 from weather_aug.scene.scene import WeatherScene
-from weather_aug.scene.styles import style_weather
 from weather_aug.scores.clip import CLIP_LARGE, Encoder, clip_ds, clip_s, load_encoder
 from weather_aug.scores.editing import EditScores, Neighbours, edit_scores, neighbours_of
 from weather_aug.view.sheet import grid, write_png
@@ -55,22 +44,6 @@ Images = dict[FrameKey, UInt8]
 OUT = Path("out/editors")
 LEAST_TILE, LEAST_ROW, MOST_TILE = 480, 220, 1600
 """Of a sheet: width and height of a picture, pixels."""
-NONE, PHYSICAL, DIFFUSION = "none", "physical", "diffusion"
-ATTENTION: Mapping[str, tuple[AttentionWeights, tuple[str, ...]]] = {
-    "self": (SELF_ONLY, ()),
-    "view": (RELEASE_WEIGHTS, ("temporal",)),
-    "temporal": (RELEASE_WEIGHTS, ("view",)),
-    "release": (RELEASE_WEIGHTS, ()),
-    "paper": (paper_weights(), ()),
-}
-"""Weights, and what is left out, of each attention in the table."""
-PEER_VALUES: Mapping[str, Callable[[str], Any]] = {
-    **dict.fromkeys(("base", "control", "condition", "source_prompt"), str),
-    **dict.fromkeys(("weights", "pictures"), Path),
-    **dict.fromkeys(("steps", "seed"), int),
-    **dict.fromkeys(("guidance", "image_guidance", "strength", "conditioning", "severity"), float),
-}
-"""Options of peers that the command line can set, and their types; see `PeerOptions`."""
 LEGEND = """\
   CLIP-S     cosine of picture and prompt (-1..1, higher is nearer the text)
   CLIP-DS    cosine of the picture's change and the text's (-1..1; 0: unchanged)
@@ -123,38 +96,6 @@ class FirstTimes:
         return self.clip.frame(key)
 
 
-class Unedited:
-    """The recorded pictures: without background editing."""
-
-    name = NONE
-    styles = STYLES
-    card: Mapping[str, Any] = {"editor": NONE}
-
-    def edit(self, moment: Moment, style: str) -> tuple[UInt8, ...]:
-        """The frames of now as they are."""
-        return tuple(frame.image for frame in moment.now)
-
-
-class Physical:
-    """The physical editor at the severity of the styles, with nothing in the air."""
-
-    name = PHYSICAL
-    styles = STYLES
-    card: Mapping[str, Any] = {"editor": PHYSICAL}
-
-    def edit(self, moment: Moment, style: str) -> tuple[UInt8, ...]:
-        """The frames of now in a style's weather."""
-        weather = style_weather(style)
-        if weather is None or moment.look is None:
-            raise ArgumentError(f"the physical editor needs a style of {STYLES} and layers")
-        pictures = []
-        for frame in moment.now:
-            layers, ambience = moment.look(frame)
-            window = (0, 0, *frame.image.shape[:2])
-            pictures.append(edited(frame, layers, weather, ambience, window))
-        return tuple(pictures)
-
-
 @dataclass(frozen=True, eq=False)
 class Bench:
     """A clip to edit, and all that is found of it once."""
@@ -163,14 +104,6 @@ class Bench:
     frames: Mapping[FrameKey, Frame]
     moments: tuple[Moment, ...]
     neighbours: Neighbours
-
-
-@dataclass(frozen=True)
-class Row:
-    """An editor in the table, loaded for a clip when its turn comes."""
-
-    name: str
-    load: Callable[[Bench], BackgroundEditor]
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,86 +177,6 @@ def measured(
     return Result(scores, float(clip_s(after, text).mean()), float(directional.mean()), seconds)
 
 
-def rows_of(given: argparse.Namespace) -> list[Row]:
-    """The rows that the command line asks for: diffusion has one for each adapter and ablation."""
-    rows = []
-    for name in given.editor:
-        if name == DIFFUSION:
-            rows += diffusion_rows(given)
-        else:
-            rows.append(Row(name, partial(loaded, name, given)))
-    return rows
-
-
-def diffusion_rows(given: argparse.Namespace) -> list[Row]:
-    """For each adapter each attention, then the first attention without each ablation."""
-    rows = []
-    for adapter in given.adapter or [None]:
-        of = f"{DIFFUSION} {adapter.name}" if len(given.adapter or []) > 1 else DIFFUSION
-        first = given.attention[0]
-        chosen = [(attention, ()) for attention in given.attention]
-        chosen += [(first, (what,)) for what in given.without]
-        for attention, without in chosen:
-            weights, left_out = ATTENTION[attention]
-            name = " ".join([f"{of}, {attention}", *(f"w/o {what}" for what in without)])
-            options = partial(
-                DiffusionOptions,
-                base=given.base or SD_TURBO,
-                adapter=adapter,
-                attention=weights,
-                without=tuple(dict.fromkeys((*left_out, *without))),
-                height=given.height,
-                device=given.device,
-            )
-            rows.append(Row(name, partial(diffusion, options)))
-    return rows
-
-
-def diffusion(options: Callable[[], DiffusionOptions], _: Bench) -> BackgroundEditor:
-    """The diffusion editor; loads torch and diffusers."""
-    from weather_aug.edit.diffusion.editor import DiffusionEditor
-
-    return DiffusionEditor.load(options())
-
-
-def loaded(name: str, given: argparse.Namespace, bench: Bench) -> BackgroundEditor:
-    """An editor that is no diffusion editor, by name; a peer loads its own networks."""
-    if name == NONE:
-        return Unedited()
-    if name == PHYSICAL:
-        return Physical()
-    from weather_aug.edit.peers.named import load_peer
-
-    return load_peer(name, peer_options(name, given), bench.scene)
-
-
-def peer_options(name: str, given: argparse.Namespace) -> PeerOptions:
-    """Options of a peer: --height, --device, and those of --peer that begin with its name.
-
-    Raises:
-        ArgumentError: If an option of --peer is none, or its value is of another type.
-    """
-    chosen: dict[str, Any] = {"height": given.height, "device": given.device}
-    for text in given.peer:
-        peer, _, rest = text.partition(".")
-        option, equals, value = rest.partition("=")
-        convert = PEER_VALUES.get(option)
-        if not equals or convert is None:
-            raise ArgumentError(
-                f"--peer takes NAME.OPTION=VALUE, OPTION of {', '.join(PEER_VALUES)}; got {text!r}"
-            )
-        if peer == name:
-            chosen[option] = _converted(text, value, convert)
-    return PeerOptions(**chosen)
-
-
-def _converted(text: str, value: str, convert: Callable[[str], Any]) -> Any:
-    try:
-        return convert(value)
-    except ValueError:
-        raise ArgumentError(f"--peer {text}: the value must be of {convert.__name__}") from None
-
-
 def table(results: Mapping[str, Result]) -> list[str]:
     """Lines of the table; "-" is what was not measured."""
     head = ["CLIP-S", "CLIP-DS", "warp t", "ratio", "/contrast", "warp v", "ratio", "/contrast"]
@@ -376,7 +229,7 @@ def compare(
     shown: dict[str, Images] = {}
     for row in rows:
         try:
-            editor = row.load(bench)
+            editor = row.load(bench.scene)
             if style not in editor.styles:
                 print(f"  {row.name}: does not edit to {style}, only to {', '.join(editor.styles)}")
                 continue
@@ -432,8 +285,10 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--clip", help="folder or id of a CLIP model; no CLIP scores without")
     parser.add_argument("--base", help="model of the diffusion editor")
     parser.add_argument("--adapter", type=Path, nargs="+", help="of the diffusion editor")
+    parser.add_argument("--weights", type=Path, help="folder of the style networks")
+    parser.add_argument("--pictures", type=Path, help="folder of a picture of each weather")
     parser.add_argument(
-        *("--peer", "--peers"),
+        "--peer",
         nargs="+",
         default=[],
         metavar="NAME.OPTION=VALUE",

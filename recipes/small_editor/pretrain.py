@@ -45,6 +45,9 @@ class Schedule:
     unet_rate: float = 1e-3
     divergence: float = 1e-4
     """Weight of the VAE's KL term, per number of the latent."""
+    tints: float = 4.0
+    """Weight of the VAE's error of colours: most of a street is grey, and a small network that is
+    not asked for the rest leaves it away."""
     one_step: float = 0.125
     """Share of the UNet's items that start from pure noise."""
     copied: float = 0.25
@@ -129,7 +132,12 @@ def train_vae(parts: Parts, pictures: Pictures, schedule: Schedule, seed: int) -
         out = parts.vae.decode(posterior.mean + posterior.std * spread).sample
         error = functional.l1_loss(out, images)
         divergence = posterior.kl().mean() / posterior.mean[0].numel()
-        loss = error + _slopes(out, images) + schedule.divergence * divergence
+        loss = (
+            error
+            + _slopes(out, images)
+            + 4 * _tints(out, images)
+            + schedule.divergence * divergence
+        )
         _descend(loss, optimiser, [parts.vae])
         recent += 0.02 * (error.item() / 2 - recent) if step else error.item() / 2
         _report("vae", step, schedule.vae_steps, f"L1 {recent:.4f}")
@@ -230,6 +238,12 @@ def _slopes(out: torch.Tensor, images: torch.Tensor) -> torch.Tensor:
     """How far differences between neighbouring pixels are off: L1 alone leaves outlines soft."""
     across = functional.l1_loss(out.diff(dim=3), images.diff(dim=3))
     return across + functional.l1_loss(out.diff(dim=2), images.diff(dim=2))
+
+
+def _tints(out: torch.Tensor, images: torch.Tensor) -> torch.Tensor:
+    """How far colours are off, lightness left out."""
+    off = functional.avg_pool2d(out - images, 4)
+    return (off - off.mean(1, keepdim=True)).abs().mean()
 
 
 def _tensor(images: torch.Tensor) -> torch.Tensor:

@@ -1,0 +1,82 @@
+"""Streets, pairs, base model and adapters of the experiment: made where they are missing."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from small_editor.measure import HeldOut
+from small_editor.pretrain import Schedule, read_pictures, small_model
+from small_editor.streets import street_scene, write_list, write_pictures
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How much of everything."""
+
+    streets: range = range(10, 34)
+    times: int = 10
+    held_out: range = range(100, 106)
+    held_out_times: int = 8
+    size_px: tuple[int, int] = (160, 96)
+    schedule: Schedule = field(default_factory=Schedule)
+    steps: int = 1600
+    batch: int = 2
+
+
+QUICK = Plan(
+    *(range(10, 11), 1, range(100, 102), 2, (48, 32)),
+    schedule=Schedule(vae_steps=3, unet_steps=3, batch=2, crop_px=(16, 24)),
+    steps=4,
+)
+
+
+def prepared(plan: Plan, out: Path) -> list[HeldOut]:
+    """Write streets, pairs and the base model where they are missing; the held-out streets."""
+    scenes, pairs = out / "scenes", out / "pairs"
+    held_out = [
+        street_scene(scenes, s, plan.held_out_times, 1, plan.size_px) for s in plan.held_out
+    ]
+    if not (out / "pairs.jsonl").is_file():
+        drives = [street_scene(scenes, s, plan.times, 9, plan.size_px) for s in plan.streets]
+        write_pictures(pairs, drives, "train")
+        write_pictures(pairs, held_out, "test")
+        write_list(pairs, out / "pairs.jsonl")
+    if not (out / "base").is_dir():
+        began = time.perf_counter()
+        small_model(out / "base", read_pictures(pairs), schedule=plan.schedule)
+        print(f"pre-training took {time.perf_counter() - began:.0f} s", flush=True)
+    return [HeldOut.of(scene) for scene in held_out]
+
+
+def trained(plan: Plan, out: Path, name: str, steps: int, *words: str) -> Path:
+    """An adapter by the command that trains them; its folder."""
+    folder = out / name
+    if not folder.is_dir():
+        width, height = plan.size_px
+        options = {
+            **{"--base": out / "base", "--out": folder, "--steps": steps, "--clip": 1.0},
+            **{"--batch-size": plan.batch, "--learning-rate": 1e-3, "--warm-up": 50},
+            **{"--unet-rank": 8, "--validate-every": 0, "--sample-every": 0},
+        }
+        words = (
+            *(str(w) for pair in options.items() for w in pair),
+            "--size",
+            str(height),
+            str(width),
+            *words,
+        )
+        began = time.perf_counter()
+        command = [
+            sys.executable,
+            "-m",
+            "weather_aug.cli",
+            "train-editor",
+            str(out / "pairs.jsonl"),
+        ]
+        subprocess.run([*command, *words], check=True)
+        print(f"{name}: {steps} steps took {time.perf_counter() - began:.0f} s", flush=True)
+    return folder

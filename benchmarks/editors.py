@@ -44,6 +44,10 @@ Images = dict[FrameKey, UInt8]
 OUT = Path("out/editors")
 LEAST_TILE, LEAST_ROW, MOST_TILE = 480, 220, 1600
 """Of a sheet: width and height of a picture, pixels."""
+COLUMNS = (
+    *("CLIP-S", "CLIP-DS", "warp t", "ratio", "/contrast", "warp v", "ratio", "/contrast"),
+    *("Bh t", "Bh v", "L1", "stat", "s/frame"),
+)
 LEGEND = """\
   CLIP-S     cosine of picture and prompt (-1..1, higher is nearer the text)
   CLIP-DS    cosine of the picture's change and the text's (-1..1; 0: unchanged)
@@ -177,28 +181,31 @@ def measured(
     return Result(scores, float(clip_s(after, text).mean()), float(directional.mean()), seconds)
 
 
-def table(results: Mapping[str, Result]) -> list[str]:
-    """Lines of the table; "-" is what was not measured."""
-    head = ["CLIP-S", "CLIP-DS", "warp t", "ratio", "/contrast", "warp v", "ratio", "/contrast"]
-    head += ["Bh t", "Bh v", "L1", "stat", "s/frame"]
-    width = max(len(name) for name in ("editor", *results)) + 1
-    lines = ["".join([f"  {'editor':{width}}", *(f"{name:>10}" for name in head)])]
-    for name, result in results.items():
-        scores = result.scores
-        warp = [
-            value
-            for each in (scores.warp_time, scores.warp_view)
-            for value in (each.absolute, each.ratio, each.ratio_per_contrast)
-        ]
-        assert scores.target is not None
-        values = [result.clip_s, result.clip_ds, *warp, scores.colour.time, scores.colour.view]
-        values += [scores.target.l1, scores.target.statistics, result.seconds_per_frame]
-        lines.append("".join([f"  {name:{width}}", *map(_cell, values)]))
-    return lines
+def heading(names: Sequence[str]) -> str:
+    """First line of the table."""
+    return "".join([f"  {'editor':{_width(names)}}", *(f"{name:>11}" for name in COLUMNS)])
+
+
+def line(name: str, result: Result, names: Sequence[str]) -> str:
+    """An editor's line of the table; "-" is what was not measured."""
+    scores = result.scores
+    warp = [
+        value
+        for each in (scores.warp_time, scores.warp_view)
+        for value in (each.absolute, each.ratio, each.ratio_per_contrast)
+    ]
+    assert scores.target is not None
+    values = [result.clip_s, result.clip_ds, *warp, scores.colour.time, scores.colour.view]
+    values += [scores.target.l1, scores.target.statistics, result.seconds_per_frame]
+    return "".join([f"  {name:{_width(names)}}", *map(_cell, values)])
+
+
+def _width(names: Sequence[str]) -> int:
+    return max(map(len, ("editor", *names)))
 
 
 def _cell(value: float) -> str:
-    return f"{'-':>10}" if math.isnan(value) else f"{value:10.4f}"
+    return f"{'-':>11}" if math.isnan(value) else f"{value:11.4f}"
 
 
 def sheet(bench: Bench, images_by_name: Mapping[str, Images]) -> UInt8:
@@ -225,6 +232,8 @@ def compare(
         flush=True,
     )
     targets, _ = pictures_of(Physical(), bench, style)
+    names = [row.name for row in rows]
+    print(heading(names), flush=True)
     results: dict[str, Result] = {}
     shown: dict[str, Images] = {}
     for row in rows:
@@ -239,9 +248,9 @@ def compare(
             continue
         results[row.name] = measured(bench, images, seconds, targets, style, encoder)
         shown[row.name] = images
+        print(line(row.name, results[row.name], names), flush=True)
     if not results:
         return results
-    print("\n".join(table(results)), flush=True)
     pairs = bench.neighbours
     print(f"  {len(pairs.time)} pairs in time, {len(pairs.view)} pairs of overlapping cameras")
     path = out / f"{bench.scene.name}-{style}"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pair_trees import list_of, pair_of, picture, save, stored_again
 
@@ -120,6 +120,7 @@ def test_training_pairs_with_a_held_out_picture_are_left_out(
         without_leaks(only, [again])
 
 
+@settings(max_examples=50)
 @given(st.data())
 def test_leaks_are_those_of_brute_force(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tyro
 from pair_trees import (
     acdc_tree,
     bdd100k_tree,
@@ -400,6 +401,14 @@ def test_the_command_refuses_leaks_or_leaves_them_out(
     judged = shutil.copy(plain / "fog/train/b.png", tmp_path / "judged.png")
     with pytest.raises(DataError, match=r"judged.png is the file fog/train/b.png"):
         ListPairs("folder", plain, out, held_out=(Path(judged),)).run()
+
+
+def test_the_command_is_typed(plain: Path, tmp_path: Path) -> None:
+    out = tmp_path / "pairs.jsonl"
+    words = ["folder", str(plain), "--out", str(out), "--held-out", "a", "b", "--drop-leaks"]
+    command = tyro.cli(ListPairs, args=words)
+    expected = ListPairs("folder", plain, out, (Path("a"), Path("b")), drop_leaks=True)
+    assert command == expected
 
 
 def test_the_command_refuses_flags_that_mean_nothing(acdc: Path, tmp_path: Path) -> None:

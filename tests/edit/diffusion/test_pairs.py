@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pair_trees import list_of, pair_of
 
@@ -61,11 +61,12 @@ def listed(tmp_path: Path) -> Path:
     return path
 
 
+@settings(max_examples=30)  # each waits for the disk
 @given(st.lists(PAIRS, min_size=1, max_size=5), NAMES)
 def test_what_is_written_is_read(
     tmp_path_factory: pytest.TempPathFactory, pairs: list[Pair], name: str
 ) -> None:
-    folder = tmp_path_factory.mktemp("lists")
+    folder = tmp_path_factory.getbasetemp()
     whole = PairList(name, folder / "data", tuple(pairs))
     write_pairs(folder / "pairs.jsonl", whole)
     assert read_pairs(folder / "pairs.jsonl") == whole

@@ -8,9 +8,9 @@ Convention:
 
 Source:
     Folders and file names as public loaders of the sets read them: ACDC with reference frames
-    (`train_ref`, `_rgb_ref_anon`, `_gt_ref_labelTrainIds`), MUSES' development kit, BDD100K's
-    format page and its issues 22 and 132 (weather is known of the 100K pictures only; the training
-    pictures of one set are validation pictures of the other).
+    (`train_ref`, `_rgb_ref_anon`, `_gt_ref_labelTrainIds`), MUSES' development kit and loaders,
+    BDD100K's format page and its issues 22 and 132 (weather is known of the 100K pictures only;
+    some training pictures of one set are validation pictures of the other).
 """
 
 from __future__ import annotations

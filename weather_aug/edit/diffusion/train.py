@@ -101,7 +101,7 @@ def train_editor(
         loaded = load_base(base)
         _check_size(options, loaded)
         train_state.begin(work, _job(chosen, loaded, options), restart=restart)
-        done = 0
+        done = options.steps
         if not train_state.is_finished(work):
             with accelerated(options) as accelerator:
                 training = _Training(chosen, loaded, work, options, accelerator)

@@ -76,6 +76,8 @@ def held(out: Path) -> Iterator[Path]:
 def begin(work: Path, job: Mapping[str, Any], *, restart: bool) -> None:
     """Make the folder of a job, or see that the one which is there is of the same.
 
+    A folder of another job in which no state was saved yet gives way: nothing is lost with it.
+
     Args:
         work: Of `held`.
         job: JSON values that the result depends on.
@@ -88,7 +90,7 @@ def begin(work: Path, job: Mapping[str, Any], *, restart: bool) -> None:
     with _files.reported(work):
         if work.exists() and not (work / JOB).exists():
             _refuse_strange(work)
-        if restart:
+        if restart or not ((work / STATE).exists() or is_finished(work)):
             # The job goes first: what is left of a removal that was cut short is nobody's.
             (work / JOB).unlink(missing_ok=True)
         if not (work / JOB).exists():

@@ -21,6 +21,7 @@ from weather_aug.edit.diffusion.options import (
     DiffusionOptions,
     paper_weights,
 )
+from weather_aug.edit.editors import editor_of
 from weather_aug.edit.peers.options import PeerOptions
 from weather_aug.edit.physical.edit import edited
 from weather_aug.errors import ArgumentError
@@ -47,18 +48,6 @@ PEER_VALUES: Mapping[str, Callable[[str], Any]] = {
 """Options of peers that the command line can set, and their types; see `PeerOptions`."""
 FOR_PEERS = {"weights": ("stylisation",), "pictures": ("stylisation", "colour-transfer")}
 """Options with a flag of their own, and the peers that take them."""
-
-
-class Unedited:
-    """The recorded pictures: without background editing."""
-
-    name = NONE
-    styles = STYLES
-    card: Mapping[str, Any] = {"editor": NONE}
-
-    def edit(self, moment: Moment, style: str) -> tuple[UInt8, ...]:
-        """The frames of now as they are."""
-        return tuple(frame.image for frame in moment.now)
 
 
 class Physical:
@@ -126,20 +115,14 @@ def diffusion_rows(given: argparse.Namespace) -> list[Row]:
 
 def diffusion(options: Callable[[], DiffusionOptions], _: WeatherScene) -> BackgroundEditor:
     """The diffusion editor; loads torch and diffusers."""
-    from weather_aug.edit.diffusion.editor import DiffusionEditor
-
-    return DiffusionEditor.load(options())
+    return editor_of(DIFFUSION, options())
 
 
 def loaded(name: str, given: argparse.Namespace, scene: WeatherScene) -> BackgroundEditor:
     """An editor that is no diffusion editor, by name; a peer loads its own networks."""
-    if name == NONE:
-        return Unedited()
     if name == PHYSICAL:
         return Physical()
-    from weather_aug.edit.peers.named import load_peer
-
-    return load_peer(name, peer_options(name, given), scene)
+    return editor_of(name, None if name == NONE else peer_options(name, given), scene)
 
 
 def peer_options(name: str, given: argparse.Namespace) -> PeerOptions:

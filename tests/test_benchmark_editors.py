@@ -10,10 +10,13 @@ from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
+import torch
 from tiny_clip import TinyClip
+from tiny_clip_model import build_tiny_clip
+from tiny_diffusion import build_tiny_sd
 
 from benchmarks import editor_rows, editors
-from benchmarks.editor_rows import ATTENTION, Physical, Row, Unedited, peer_options, rows_of
+from benchmarks.editor_rows import ATTENTION, Physical, Row, peer_options, rows_of
 from benchmarks.editors import (
     FirstTimes,
     arguments,
@@ -23,6 +26,7 @@ from benchmarks.editors import (
     first_keys,
     heading,
     line,
+    main,
     measured,
     moments_of,
     pictures_of,
@@ -31,9 +35,13 @@ from benchmarks.editors import (
 )
 from weather_aug.clip.types import FrameKey
 from weather_aug.edit.background import STYLES, BackgroundEditor
+from weather_aug.edit.diffusion.adapted import AdaptedModel
+from weather_aug.edit.diffusion.adapter_files import save_adapter
+from weather_aug.edit.diffusion.base import load_base
 from weather_aug.edit.diffusion.editor import effective_weights
 from weather_aug.edit.diffusion.options import DiffusionOptions
-from weather_aug.edit.diffusion.spec import CLEAR, PROMPTS
+from weather_aug.edit.diffusion.spec import CLEAR, PROMPTS, AdapterSpec
+from weather_aug.edit.editors import Unedited
 from weather_aug.errors import ArgumentError, DataError
 from weather_aug.render.options import EFFECTS, RenderOptions
 from weather_aug.scene.scene import WeatherScene
@@ -71,6 +79,15 @@ class TwoNumbers:
     def texts(self, prompts):
         assert prompts == [PROMPTS["snow"], PROMPTS[CLEAR]]
         return np.array([[0.0, 1.0], [1.0, 0.0]])
+
+
+def perturbed(model, seed):
+    """With every trained tensor away from zero, where an untrained adapter would do nothing."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in model.trained().values():
+            parameter.add_(torch.randn(parameter.shape, generator=generator), alpha=0.05)
+    return model
 
 
 def given(*words):
@@ -297,3 +314,31 @@ def test_peers_are_loaded_with_their_options(scene, bench):
 def test_no_time_is_a_number(bench):
     assert 0 <= result_of(bench, Unedited()).seconds_per_frame < 1
     assert math.isnan(result_of(bench, Unedited()).clip_s)
+
+
+def test_diffusion_and_clip_have_their_numbers(scene, tmp_path, capsys):
+    """The command itself, on a random small model and a random small CLIP."""
+    base, adapter = build_tiny_sd(tmp_path / "base", seed=0), tmp_path / "adapter"
+    model = AdaptedModel(load_base(str(base)), AdapterSpec(unet_rank=2), seed=0)
+    save_adapter(perturbed(model, seed=1), adapter)
+    main(
+        [
+            *(str(scene.path), "--frames", "2", "--out", str(tmp_path / "out")),
+            *("--clip", str(build_tiny_clip(tmp_path / "clip")), "--editor", "none", "diffusion"),
+            *("--base", str(base), "--adapter", str(adapter), "--height", "24"),
+            *("--attention", "release", "--without", "labels"),
+        ]
+    )
+    said = capsys.readouterr().out
+    written = json.loads((tmp_path / "out" / "tiny-snow.json").read_text(encoding="utf-8"))
+    results = written["results"]
+    names = ["none", "diffusion, release", "diffusion, release w/o labels"]
+    assert list(results) == names
+    assert all(name in said for name in names)
+    assert "CLIP-S     cosine of picture and prompt" in said
+    assert results["none"]["clip_ds"] == 0
+    for name in names[1:]:
+        assert 0 < abs(results[name]["clip_ds"]) <= 1
+        assert results[name]["scores"]["target"]["l1"] > 0
+    errors = [results[name]["scores"]["warp_time"]["absolute"] for name in names]
+    assert len(set(errors)) == len(names)

@@ -64,9 +64,12 @@ def build_tiny_controlnet(folder: Path, base: Path, seed: int) -> Path:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         net = ControlNetModel.from_unet(unet, conditioning_embedding_out_channels=(8, 8, 16, 16))
-        convolutions = [*net.controlnet_down_blocks, net.controlnet_mid_block]
-        for layer in [*convolutions, net.controlnet_cond_embedding.conv_out]:
+        for layer in [*net.controlnet_down_blocks, net.controlnet_mid_block]:
             torch.nn.init.normal_(layer.weight, std=0.2)
+        # As they come, six small convolutions leave nothing of what they are shown.
+        for layer in net.controlnet_cond_embedding.modules():
+            if isinstance(layer, torch.nn.Conv2d):
+                torch.nn.init.kaiming_normal_(layer.weight)
     net.save_pretrained(folder, safe_serialization=True)
     return folder
 

@@ -29,7 +29,7 @@ from weather_aug.errors import (
     OutputError,
 )
 from weather_aug.scene import build as building
-from weather_aug.scene import store
+from weather_aug.scene import publish, store
 from weather_aug.scene.layers import Street
 from weather_aug.scene.route import street_axes
 from weather_aug.scene.scene import WeatherScene
@@ -364,13 +364,14 @@ def _cut_short(call: int, action: Callable[[], object]) -> bool:
 def test_a_replacement_cut_short_anywhere_leaves_one_whole_scene(tmp_path: Path) -> None:
     old = WeatherScene.build(TinyClip(frames=1), tmp_path / "old")
     new = WeatherScene.build(TinyClip(frames=2), tmp_path / "new")
+    files = new.manifest.files
     found = []
     for call in range(1, 100):
         out = tmp_path / str(call) / "scene"
         work = out.with_name(out.name + WORK)
         shutil.copytree(old.path, out)
         shutil.copytree(new.path, work)
-        was_cut = _cut_short(call, lambda work=work, out=out: building._publish(work, out))
+        was_cut = _cut_short(call, lambda work=work, out=out: publish.publish(work, out, files))
         with pytest.raises(ConflictError, match="exists"):
             WeatherScene.build(TinyClip(frames=2), out)
         found.append(WeatherScene.load(out, verify=True).digest)

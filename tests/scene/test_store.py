@@ -21,8 +21,10 @@ from tiny_clip import TinyClip, digests_of
 from weather_aug import _files
 from weather_aug.clip.types import Box, Frame, FrameKey
 from weather_aug.edit.ambience import Ambience
+from weather_aug.edit.background import STYLES
 from weather_aug.errors import DataError, IntegrityError, SceneError, WeatherAugError
 from weather_aug.scene import store
+from weather_aug.scene.backgrounds_record import background_path
 from weather_aug.scene.boxes import MAX_BOXES, MAX_BOXES_BYTES, read_boxes
 from weather_aug.scene.scene import WeatherScene
 
@@ -272,7 +274,8 @@ def test_the_longest_manifest_opens_under_its_own_limit(tiny_clip: TinyClip) -> 
     parts = ("image", "depth", "label", "boxes", "layers", "small", "classes")
     key = FrameKey(store.MAX_FRAMES, name)
     entry["files"] = {part: store.part_path(key, part) for part in parts}
-    files = {path: file for path in entry["files"].values()}
+    styled = [background_path(style, key) for style in STYLES]
+    files = {path: file for path in (*entry["files"].values(), *styled)}
     empty = len(store.manifest_bytes({"frames": [], "files": {}}))
     each = len(store.manifest_bytes({"frames": [entry], "files": files})) - empty
     assert 1000 < each

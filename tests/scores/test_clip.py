@@ -13,13 +13,13 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from PIL import Image
+from tiny_clip_model import SIDE, build_tiny_clip
 
 from weather_aug.edit.diffusion.spec import CLEAR, PROMPTS
 from weather_aug.errors import ArgumentError, DataError
 from weather_aug.scores import clip
 from weather_aug.scores.clip import clip_ds, clip_s, load_encoder
 
-SIDE = 32
 ROUNDING = 1e-12
 VECTOR = arrays(np.float64, 6, elements=st.floats(-4, 4)).filter(lambda v: np.abs(v).max() > 0.1)
 SCALE = st.floats(1e-3, 1e3)
@@ -145,35 +145,7 @@ def test_a_fault_in_the_formulas_is_found_out(fault, monkeypatch):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A CLIP of 20 thousand random weights with a tokenizer of letters, saved as the real ones."""
-    import torch
-    from transformers import CLIPConfig, CLIPImageProcessorPil, CLIPModel, CLIPTokenizer
-
-    at = tmp_path_factory.mktemp("clip")
-    letters = "abcdefghijklmnopqrstuvwxyz"
-    words = ["<|startoftext|>", "<|endoftext|>", *letters, *(f"{c}</w>" for c in letters)]
-    merges = [("s", "n"), ("r", "a"), ("i", "n</w>")]
-    words += ["".join(pair) for pair in merges]
-    tokenizer = CLIPTokenizer(
-        vocab={word: i for i, word in enumerate(words)}, merges=merges, model_max_length=77
-    )
-    small = dict(hidden_size=16, intermediate_size=32, num_hidden_layers=2, num_attention_heads=2)
-    config = CLIPConfig(
-        text_config=small
-        | dict(vocab_size=len(words), max_position_embeddings=77, bos_token_id=0, eos_token_id=1),
-        vision_config=small | dict(image_size=SIDE, patch_size=8),
-        projection_dim=12,
-    )
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        model = CLIPModel(config)
-    model.save_pretrained(at)
-    tokenizer.save_pretrained(at)
-    processor = CLIPImageProcessorPil(
-        size={"shortest_edge": SIDE}, crop_size={"height": SIDE, "width": SIDE}
-    )
-    processor.save_pretrained(at)
-    return at
+    return build_tiny_clip(tmp_path_factory.mktemp("clip") / "tiny")
 
 
 @pytest.fixture(scope="module")

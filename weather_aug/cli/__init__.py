@@ -1,4 +1,4 @@
-"""The command line: build | render | sweep | export | view | inspect | demo."""
+"""The command line: demo, build, render, sweep, export, view, inspect, list-pairs, train-editor."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import os
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,8 +15,11 @@ import tyro
 from tyro.conf import Positional
 
 from weather_aug import __version__, _files
+from weather_aug.cli.build import Build
+from weather_aug.cli.pairs import ListPairs
 from weather_aug.cli.render import Render
 from weather_aug.cli.terminal import check_folder, complain, say, to_people
+from weather_aug.cli.train import TrainEditor
 from weather_aug.cli.view import View
 from weather_aug.errors import (
     ArgumentError,
@@ -30,69 +34,6 @@ DEMO_WIDTH_PX = (32, 4096)
 """Narrower, a picture of nine sixteenths its width has too few rows for the street."""
 DEMO_STREET = 3
 """Seed of a street on which a car comes with its lamps on in the middle of the drive."""
-
-
-@dataclass(frozen=True)
-class Build:
-    """Precompute a clip into a scene folder; run again to continue interrupted work."""
-
-    clip: Positional[str]
-    """Clip, "scheme:path?option=value&…" (kitti-odometry, kitti-raw, dgp, folder, street)."""
-    out: Path
-    """Scene folder to make."""
-    editor: str = "physical"
-    """How backgrounds get their weather."""
-    weathers: tuple[str, ...] = ("rain", "snow", "fog")
-    """Types the scene is meant for."""
-    overwrite: bool = False
-    """Replace the scene that stands in `out`."""
-    reconstruct: bool = False
-    """Turn the frames into Gaussians, too, so that they can be rendered from elsewhere; takes
-    minutes."""
-    steps: int | None = None
-    """Of the fit; see `FitOptions` for this and the next two."""
-    count: int | None = None
-    """Gaussians at the most."""
-    scale: float | None = None
-    """Of the pictures' sides for the fit, in (0, 1]."""
-    styles: tuple[str, ...] | None = None
-    """Weathers whose colours the Gaussians learn; rain snow fog if not given."""
-
-    def run(self) -> None:
-        """Build and say what was made."""
-        from weather_aug.clip.open import open_clip
-        from weather_aug.scene.scene import WeatherScene
-
-        clip = open_clip(self.clip)
-        scene = WeatherScene.build(
-            clip,
-            self.out,
-            editor=self.editor,
-            weathers=self.weathers,
-            progress=to_people(),
-            overwrite=self.overwrite,
-            **self._reconstruction(),
-        )
-        say(f"{len(scene.keys)} frames of {', '.join(scene.cameras)} in {self.out}")
-        record = scene.manifest.reconstruction
-        if record is not None:
-            count = record.shapes["background_means_m"][0] + record.shapes["owners"][0]
-            told = ", ".join(f"{name} {value:.4g}" for name, value in record.fit.items())
-            say(f"{count} Gaussians of {len(record.cameras)} frames ({told})")
-
-    def _reconstruction(self) -> dict[str, Any]:
-        """Arguments of `WeatherScene.build`."""
-        numbers: dict[str, Any] = {"steps": self.steps, "count": self.count, "scale": self.scale}
-        given = {name: value for name, value in numbers.items() if value is not None}
-        if not self.reconstruct:
-            names = [*given, *(["styles"] if self.styles is not None else [])]
-            if names:
-                raise ArgumentError(f"--{names[0]} needs --reconstruct")
-            return {}
-        from weather_aug.gaussians.options import FitOptions
-
-        chosen: dict[str, Any] = {"reconstruct": True, "reconstruction": FitOptions(**given)}
-        return chosen | ({} if self.styles is None else {"styles": self.styles})
 
 
 @dataclass(frozen=True)
@@ -258,6 +199,8 @@ Command = (
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Inspect, tyro.conf.subcommand("inspect")]
+    | Annotated[ListPairs, tyro.conf.subcommand("list-pairs")]
+    | Annotated[TrainEditor, tyro.conf.subcommand("train-editor")]
 )
 
 
@@ -279,7 +222,7 @@ def main(arguments: list[str] | None = None) -> None:
         complain(str(error))
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
-        goes_on = isinstance(command, Build | Export)
+        goes_on = isinstance(command, Build | Export | TrainEditor)
         cure = "; run the same command again to continue" if goes_on else ""
         complain(f"interrupted{cure}")
         sys.exit(130)
@@ -352,12 +295,24 @@ def _inspect_scene(path: Path) -> list[str]:
     size_mib = sum(stored.size for stored in manifest.files.values()) / 2**20
     say(f"scene {scene.name}, digest {scene.digest[:12]}, editor {manifest.editor}")
     say(f"{len(scene.keys)} frames ({labelled} labelled) of {', '.join(scene.cameras)}")
+    if manifest.backgrounds is not None:
+        say(f"backgrounds: {', '.join(manifest.styles)}{_named(manifest.backgrounds.card)}")
     if manifest.reconstruction is not None:
         shapes, styles = manifest.reconstruction.shapes, manifest.reconstruction.styles
         count = shapes["background_means_m"][0] + shapes["owners"][0]
         say(f"{count} Gaussians, styles: {', '.join(styles) or 'none'}")
     say(f"{len(manifest.files)} files, {size_mib:.1f} MiB")
     return scene.damaged_files()
+
+
+def _named(card: Mapping[str, Any]) -> str:
+    """What an editor's card says in so many words, for people: texts and numbers, not lists."""
+    told = [
+        f"{printable(name)} {printable(value)}"
+        for name, value in card.items()
+        if isinstance(value, str | int | float) and name != "editor"
+    ]
+    return f" ({', '.join(told)})" if told else ""
 
 
 def _state(recipe: str) -> str:

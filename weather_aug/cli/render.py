@@ -64,7 +64,8 @@ class Render:
     turn: tuple[float, float, float] | None = None
     """Degrees of yaw to the left, pitch upwards, and roll clockwise from the recorded camera."""
     style: str | None = None
-    """Weather whose colours the Gaussians take, instead of the editor's: rain, snow or fog."""
+    """Weather whose stored background is shown, or whose colours the Gaussians take, instead of
+    what the weather asks for: rain, snow or fog; "physical" for the physical editor's dressing."""
     amount: float = 1.0
     """Of the style, in [0, 1]."""
     without_actors: tuple[int, ...] = ()

@@ -72,14 +72,14 @@ class TrainEditor:
     """Of each style's low-rank set; 128 if not given."""
     vae_rank: int | None = None
     """Of the VAE's low-rank set; 4 if not given."""
-    skips: bool | None = None
-    """Whether the decoder sees the encoder's activations; True if not given."""
+    skips: bool = True
+    """Whether the decoder sees the encoder's activations."""
     optimiser: str | None = None
     """adamw (the default) or adamw8bit, which needs bitsandbytes and a GPU."""
     mixed_precision: str | None = None
     """no (the default), bf16, or fp16 on a GPU."""
-    gradient_checkpointing: bool | None = None
-    """Less memory for a third more time; False if not given."""
+    gradient_checkpointing: bool = False
+    """Less memory for a third more time."""
     save_every: int | None = None
     """Steps between two states on disk; 500 if not given."""
     sample_every: int | None = None

@@ -129,9 +129,10 @@ def _is_read(path: Path) -> bool:
 
 def _cached(model_id: str, to: str, what: str) -> Path:
     hub = require("huggingface_hub", extra="edit", to=to)
+    errors = require("huggingface_hub.errors", extra="edit", to=to)
     try:
         return Path(hub.snapshot_download(model_id, local_files_only=True))
-    except (hub.errors.LocalEntryNotFoundError, hub.errors.HFValidationError) as error:
+    except (errors.LocalEntryNotFoundError, errors.HFValidationError) as error:
         raise missing_weights(model_id, licence_of(model_id), what) from error
 
 

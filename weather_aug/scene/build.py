@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,25 +12,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from weather_aug import _files, _lock
+from weather_aug import _files
 from weather_aug.clip.types import Clip, Frame, FrameKey
 from weather_aug.edit.ambience import ambience_of
+from weather_aug.edit.background import STYLES, BackgroundEditor
 from weather_aug.edit.physical.mirror_seen import Seen
 from weather_aug.edit.physical.site import Site
-from weather_aug.errors import (
-    ArgumentError,
-    ClipError,
-    ConflictError,
-    DataError,
-    OutputError,
-    printable,
-)
-from weather_aug.scene import store
+from weather_aug.errors import ArgumentError, ClipError, DataError, printable
+from weather_aug.scene import publish, store
+from weather_aug.scene.backgrounds import Editing, editing_of, write_backgrounds
 from weather_aug.scene.journal import Round, digest_record, make_all
 from weather_aug.scene.layers import PARTS as LAYER_PARTS
 from weather_aug.scene.layers import encode_layers, layers_seen
 from weather_aug.scene.policy import TYPES
-from weather_aug.scene.reconstruct import FITTING, Built, Wanted, write_geometry, write_styles
+from weather_aug.scene.reconstruct import Built, Wanted, write_geometry, write_styles
 from weather_aug.scene.records import (
     FRAMES,
     SHELTER,
@@ -43,15 +37,12 @@ from weather_aug.scene.records import (
 )
 from weather_aug.scene.route import street_axes
 from weather_aug.scene.shelter import View, shelter_of
+from weather_aug.scene.styles import PHYSICAL
 
 if TYPE_CHECKING:
     from weather_aug.gaussians.types import Reconstruction
 
-EDITORS = ("physical",)
 JOURNAL, LAYERS_JOURNAL = "journal.jsonl", "layers.jsonl"
-UNFINISHED_SUFFIX = ".building"
-LOCK_SUFFIX = ".building.lock"
-REPLACED_SUFFIX = ".replaced"
 
 Float64 = NDArray[np.float64]
 Entries = list[dict[str, Any]]
@@ -63,66 +54,75 @@ Files = dict[str, Any]
 def build(
     clip: Clip,
     out: Path,
-    editor: str,
-    weathers: Sequence[str],
+    editor: str | BackgroundEditor,
+    weathers: Sequence[str] | None,
     *,
     progress: bool,
     overwrite: bool,
     wanted: Wanted | None = None,
+    editor_options: Any = None,
 ) -> None:
     """Write the scene of `clip` to the folder `out`, which appears only when it is complete.
 
-    There are two rounds over the frames: the first stores them; the second, when the way driven is
-    known, what the editor sees in each. Where Gaussians are wanted, their geometry comes between
-    the two, so that the editor sees what the road mirrors, and their styles, which need the
-    editor, after both; see `scene.reconstruct`. Work in progress stands in `out` + ".building" with
-    a journal of each round; the same call again continues it, after making the first finished frame
-    once more to see that the clip is still the same. Bad input removes it: there is nothing to
-    continue. A scene that is replaced stands in `out` + ".replaced" until the new one is in its
-    place.
+    There are up to three rounds over the frames: the first stores them; the second, when the way
+    driven is known, what the physical editor sees in each; the third, of another editor, their
+    backgrounds; see `scene.backgrounds`. Where Gaussians are wanted, their geometry comes after the
+    first, so that the editor sees what the road mirrors, and their styles, which need the
+    backgrounds, after all; see `scene.reconstruct`. Work in progress stands in `out` + ".building"
+    with a journal of each round; the same call again continues it, after making the first finished
+    step once more to see that the clip and the editor are still the same. Bad input removes it:
+    there is nothing to continue. A scene that is replaced stands in `out` + ".replaced" until the
+    new one is in its place.
 
     Args:
         clip: The drive; every frame needs depth.
         out: Folder to make, and its parents.
-        editor: How backgrounds get their weather; "physical" does it while rendering.
-        weathers: Types the scene is meant for: a note in the manifest for readers. The physical
-            editor prepares for none, since it edits while rendering; every scene renders them all.
+        editor: How backgrounds get their weather; "physical" does it while rendering, all others
+            (one of `edit.editors.EDITORS`, or a `BackgroundEditor`) store them in the scene.
+        weathers: Types the scene is meant for; all that the editor knows if None. A note in the
+            manifest for readers where the editor is physical: it prepares for none. Other editors
+            store a background of each frame for each.
         progress: Show a bar for each round.
         overwrite: Replace `out` if it is a scene already.
         wanted: What to reconstruct, None for no Gaussians.
+        editor_options: Of an editor that is named; see `edit.editors.editor_of`.
 
     Raises:
-        ArgumentError: If the editor or a weather is unknown.
+        ArgumentError: If the editor or a weather is unknown, the editor cannot edit to a weather,
+            or does not return pictures.
         ConflictError: If `out` exists, or another process builds it.
         ClipError: If the clip is empty or too long, a frame has no depth, or unrelated pictures
             are to be reconstructed.
         SceneError: If a name cannot stand in a file name, or a frame cannot be stored.
         OutputError: If the output lies inside another scene, or cannot be written.
     """
-    _check_choices(editor, weathers)
+    _check_weathers(weathers)
     _check_clip(clip)
     if wanted is not None and not _is_drive(clip):
         raise ClipError(
             f"clip {clip.name} is of unrelated pictures; only a drive can be reconstructed"
         )
-    out = _located(out)
-    with _held(out):
-        _settle_replacement(out)
-        _check_free(out, overwrite)
-        work = _beside(out, UNFINISHED_SUFFIX)
+    editing = editing_of(editor, editor_options, weathers, clip)
+    if weathers is None:
+        weathers = STYLES if editing is None else editing.styles
+    out = publish.located(out)
+    with publish.held(out):
+        publish.settle_replacement(out)
+        publish.check_free(out, overwrite)
+        work = publish.work_folder(out)
         try:
-            content = _content(clip, work, editor, weathers, progress, wanted)
+            content = _content(clip, work, editing, weathers, progress, wanted)
         except DataError:
             shutil.rmtree(work, ignore_errors=True)
             raise
         _files.write_whole(work / store.MANIFEST, store.manifest_bytes(content))
-        _publish(work, out)
+        publish.publish(work, out, content["files"])
 
 
 def _content(
     clip: Clip,
     work: Path,
-    editor: str,
+    editing: Editing | None,
     weathers: Sequence[str],
     progress: bool,
     wanted: Wanted | None,
@@ -139,7 +139,7 @@ def _content(
         files |= file
     content = {
         "name": clip.name,
-        "editor": editor,
+        "editor": PHYSICAL if editing is None else editing.editor.name,
         "weathers": list(weathers),
         "axes_world": axes_world.tolist(),
         "airlight": airlight,
@@ -154,9 +154,16 @@ def _content(
         built = write_geometry(work, manifest, files, wanted, progress=progress)
     entries, looks = _write_layers(work, entries, axes_world, is_drive, progress, built)
     content |= {"frames": entries, "files": files | looks}
+    # What is not asked for leaves no trace in the manifest.
+    if editing is not None:
+        manifest = store.manifest_of(content)
+        needs = [is_drive, entries, content["files"]]
+        entry, files = write_backgrounds(
+            work, manifest, needs, editing, clip.cameras, progress=progress
+        )
+        content |= {"backgrounds": entry, "files": content["files"] | files}
     if wanted is None or built is None:
         return content
-    # Scenes without Gaussians have the manifest that they always had.
     manifest = store.manifest_of(content)
     built = write_styles(work, manifest, content["files"], built, wanted, progress=progress)
     return content | {"reconstruction": built.entry, "files": content["files"] | built.files}
@@ -186,115 +193,10 @@ def _write_shelter(
     return record, {SHELTER: digest_record(data)}
 
 
-def _check_choices(editor: str, weathers: Sequence[str]) -> None:
-    if editor not in EDITORS:
-        raise ArgumentError(f"editor {printable(editor)!r} is not one of {', '.join(EDITORS)}")
-    unknown = sorted(set(weathers) - set(TYPES))
+def _check_weathers(weathers: Sequence[str] | None) -> None:
+    unknown = sorted(set(weathers or ()) - set(TYPES))
     if unknown:
         raise ArgumentError(f"weather {printable(unknown[0])!r} is not one of {', '.join(TYPES)}")
-
-
-def _located(out: Path) -> Path:
-    """`out` without links, so that one folder has one lock; refuse a place inside a scene."""
-    try:
-        located = out.resolve()
-        scenes = [folder for folder in located.parents if _is_scene(folder)]
-    except (OSError, RuntimeError, ValueError) as error:
-        raise OutputError(f"cannot write to {printable(out, 200)}: {error}") from None
-    if not located.name:
-        raise ConflictError(f"{printable(out, 200)} exists; choose another folder")
-    if scenes:
-        raise OutputError(
-            f"{printable(out, 200)} lies inside the scene {printable(scenes[0], 200)}; choose a "
-            "folder outside it"
-        )
-    return located
-
-
-def _is_scene(folder: Path) -> bool:
-    return (folder / store.MANIFEST).is_file() and (folder / FRAMES).is_dir()
-
-
-def _check_free(out: Path, overwrite: bool) -> None:
-    if not out.exists():
-        return
-    if not (out / store.MANIFEST).is_file():
-        raise ConflictError(
-            f"{printable(out, 200)} exists; choose another folder, or remove it yourself: it is no "
-            f"scene (no {store.MANIFEST}), so overwrite does not replace it"
-        )
-    if not overwrite:
-        raise ConflictError(
-            f"{printable(out, 200)} exists; choose another folder, or pass overwrite to replace "
-            "the scene"
-        )
-
-
-def _beside(out: Path, suffix: str) -> Path:
-    return out.with_name(out.name + suffix)
-
-
-@contextmanager
-def _held(out: Path) -> Iterator[None]:
-    """Build `out` alone; the lock's file goes with the lock."""
-    path = _beside(out, LOCK_SUFFIX)
-    with _lock.exclusive(path, f"{printable(out, 200)} is being built"):
-        try:
-            yield
-        finally:
-            with _files.reported(path):
-                path.unlink(missing_ok=True)
-
-
-def _publish(work: Path, out: Path) -> None:
-    """Put finished work in its place; whenever this is cut short, one whole scene is left."""
-    replaced = _beside(out, REPLACED_SUFFIX)
-    with _files.reported(out):
-        for journal in (JOURNAL, LAYERS_JOURNAL):
-            (work / journal).unlink(missing_ok=True)
-        if (work / FITTING).exists():
-            shutil.rmtree(work / FITTING)
-        try:
-            if out.exists():
-                out.rename(replaced)
-                _files.sync_folder(out.parent)
-            work.rename(out)
-        finally:
-            _files.sync_folder(out.parent)
-            _settle_replacement(out)
-
-
-def _settle_replacement(out: Path) -> None:
-    """Put back the scene of a replacement that was cut short, or remove it if a new one stands."""
-    replaced = _beside(out, REPLACED_SUFFIX)
-    if not replaced.exists():
-        return
-    with _files.reported(replaced):
-        if not any(replaced.iterdir()):
-            replaced.rmdir()
-        elif not (replaced / store.MANIFEST).is_file():
-            raise ConflictError(
-                f"{printable(replaced, 200)} stands where a replaced scene is kept, but is none; "
-                "move it elsewhere"
-            )
-        elif out.exists():
-            _remove_scene(replaced)
-        else:
-            replaced.rename(out)
-        _files.sync_folder(out.parent)
-
-
-def _remove_scene(folder: Path) -> None:
-    """Remove a scene, its manifest last: what is cut short is still known as a scene."""
-    for entry in folder.iterdir():
-        if entry.name == store.MANIFEST:
-            continue
-        if entry.is_dir() and not entry.is_symlink():
-            shutil.rmtree(entry)
-        else:
-            entry.unlink()
-    (folder / store.MANIFEST).unlink(missing_ok=True)
-    folder.rmdir()
 
 
 def _check_clip(clip: Clip) -> None:

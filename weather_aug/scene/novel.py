@@ -16,9 +16,8 @@ from weather_aug.gaussians.draw import View, view
 from weather_aug.gaussians.gather import Weights, camera_of
 from weather_aug.gaussians.types import CLASSES, Actor, Gaussians, Reconstruction, Sky
 from weather_aug.render.compose import RenderedFrame
-from weather_aug.render.label import kept_labels
-from weather_aug.render.label_snow import buried_borders, covered_faces, snow_limits
 from weather_aug.render.options import RenderOptions
+from weather_aug.scene.backdrop import under_snow
 from weather_aug.scene.viewpoint import Viewpoint, moved
 from weather_aug.taxonomy import IGNORE
 from weather_aug.weather import Weather
@@ -49,10 +48,13 @@ class NovelFrame(NamedTuple):
 
 
 def novel_camera(
-    reconstruction: Reconstruction, recorded: Frame, axes_world: Float64, viewpoint: Viewpoint
+    reconstruction: Reconstruction,
+    recorded: Frame,
+    axes_world: Float64,
+    viewpoint: Viewpoint | None,
 ) -> Camera:
-    """The camera of a recorded frame, refined where it was, at a viewpoint."""
-    return moved(camera_of(reconstruction, recorded), axes_world, viewpoint)
+    """The camera of a recorded frame, refined where it was, at a viewpoint; None is there."""
+    return moved(camera_of(reconstruction, recorded), axes_world, viewpoint or Viewpoint())
 
 
 def novel_frame(
@@ -189,15 +191,11 @@ def honest(
         lying: What lies on the ground in the frame's style; see `lying_in`.
         options: As they were asked for, not `carried_options`.
     """
+    shot = under_snow(shot, novel.frame, lying, options)
     top, left, height, width = shot.window
     unseen = ~novel.seen[top : top + height, left : left + width]
     label, full = shot.label, shot.label_full
     invalid = shot.invalid | unseen
-    limits = snow_limits(lying, options)
-    if limits is not None and label is not None:
-        buried = buried_borders(novel.frame, shot.window, limits)
-        label = kept_labels(label, buried, options.labels)
-        invalid |= buried | covered_faces(novel.frame, shot.window, limits)
     if label is not None and full is not None:
         label, full = (np.where(unseen, np.uint8(IGNORE), plane) for plane in (label, full))
     frame = novel.masked().frame

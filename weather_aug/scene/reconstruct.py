@@ -1,9 +1,9 @@
 """Rounds of a build: the stored frames → Gaussians and their classes; with layers, weather styles.
 
 Each step stands in a journal of its own, with all that it depends on: geometry on the frames and
-the options, classes on the geometry, styles on the geometry and on the layers, which the editor
-needs. A build that was cut short goes on after the last whole step, and within the fit from its
-last checkpoint.
+the options, classes on the geometry, styles on the geometry, on the layers, which the physical
+editor needs, and on the backgrounds that another editor stored. A build that was cut short goes on
+after the last whole step, and within the fit from its last checkpoint.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from weather_aug.clip.types import Frame
 from weather_aug.edit.physical.edit import edited
 from weather_aug.errors import ArgumentError, printable
 from weather_aug.scene import store
+from weather_aug.scene.backdrop import read_background
 from weather_aug.scene.journal import Round, make_all
 from weather_aug.scene.policy import TYPES
 from weather_aug.scene.reconstruction import (
@@ -164,11 +165,11 @@ def write_styles(
     *,
     progress: bool,
 ) -> Built:
-    """Give what was built the colours of the weathers wanted; remove arrays of others.
+    """Give what was built the colours of the weathers wanted.
 
     Args:
-        work: Folder with all frames, their layers and the geometry.
-        manifest: That names frames and layers.
+        work: Folder with all frames, their layers, backgrounds if there are any, and the geometry.
+        manifest: That names them.
         files: Their sizes and digests.
         built: By `write_geometry`.
         wanted: What to reconstruct.
@@ -186,7 +187,6 @@ def write_styles(
             work, "styles", head, lambda: _styles(work, manifest, wanted, built.scene, progress)
         )
         entries, written = (*entries, entry), written | made
-    _remove_others(work, written)
     # What is built can be read.
     return Built(entries, written, _read(work, joined(entries), written))
 
@@ -264,15 +264,19 @@ def _styles(
 def styled_frame(
     work: Path, manifest: Manifest, record: FrameRecord, frame: Frame, style: str
 ) -> Frame:
-    """A stored frame as the editor shows it in a style's weather, with nothing in the air.
+    """A stored frame in a style: its stored background where there is one.
+
+    Else as the physical editor shows it in the style's weather, with nothing in the air.
 
     Args:
         work: Folder with the frame's files.
-        manifest: Of all frames.
+        manifest: Of all frames, and of the backgrounds.
         record: Of the frame, with its layers.
         frame: As it was recorded.
         style: Name of a weather.
     """
+    if style in manifest.styles:
+        return replace(frame, image=read_background(work, record, style))
     layers = store.read_layers(work, record, frame.label)
     weather = style_weather(style)
     assert layers is not None and weather is not None
@@ -286,14 +290,6 @@ def _read(work: Path, entry: dict[str, Any], files: dict[str, Any]) -> Reconstru
     record = parse_reconstruction(json.loads(json.dumps(entry)), listed)
     assert record is not None
     return read_reconstruction(work, record)
-
-
-def _remove_others(work: Path, files: Mapping[str, Any]) -> None:
-    """Remove arrays of steps that are no longer asked for."""
-    with _files.reported(work):
-        for path in (work / GAUSSIANS).iterdir():
-            if path.relative_to(work).as_posix() not in files:
-                path.unlink()
 
 
 def _digest_of(value: Any) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug._checks import MAX_PIXELS
-from weather_aug.clip.types import RIGID_TOLERANCE, Camera, FrameKey
+from weather_aug.clip.types import RIGID_TOLERANCE, Camera, Frame, FrameKey
 from weather_aug.edit.ambience import CAMERA_HEIGHT_M, CAMERA_HEIGHT_RANGE_M, Ambience
 from weather_aug.errors import SceneError, printable
 from weather_aug.particles.shelter import CELL_M
@@ -22,6 +22,7 @@ from weather_aug.scene.route import route_of
 from weather_aug.scene.viewpoint import raised_height_m
 
 if TYPE_CHECKING:
+    from weather_aug.scene.backgrounds_record import BackgroundsRecord
     from weather_aug.scene.reconstruction_record import ReconstructionRecord
 
 FRAMES = "frames"
@@ -85,6 +86,8 @@ class Manifest:
     shelter: ShelterRecord | None = None
     reconstruction: ReconstructionRecord | None = None
     """None in a scene that was built without Gaussians."""
+    backgrounds: BackgroundsRecord | None = None
+    """None in a scene whose editor edits while rendering."""
     digest: str = ""
     """SHA-256 of the manifest's bytes; it names the scene's content, since it lists all digests."""
     by_key: Mapping[FrameKey, FrameRecord] = field(init=False)
@@ -94,9 +97,24 @@ class Manifest:
         object.__setattr__(self, "by_key", {record.key: record for record in self.frames})
         object.__setattr__(self, "_height_by_camera_m", _heights_m(self.frames))
 
+    @property
+    def is_drive(self) -> bool:
+        """Whether the pictures are of one drive; unrelated ones have no airlight in common."""
+        return self.airlight is not None
+
+    @property
+    def styles(self) -> tuple[str, ...]:
+        """Of the stored backgrounds; none without."""
+        return () if self.backgrounds is None else self.backgrounds.styles
+
     def camera_height_m(self, camera: str) -> float:
         """Height of a camera over the road, metres: the median of its frames."""
         return self._height_by_camera_m[camera]
+
+    def raised_m(self, frame: Frame) -> float:
+        """How much higher a frame's camera stands than the recorded one."""
+        here, there = frame.camera, self.by_key[frame.key].camera
+        return float(self.axes_world[2] @ (here.centre_world - there.centre_world))
 
     def ambience(self, record: FrameRecord, raised_m: float = 0.0) -> Ambience:
         """Light around a frame whose camera stands `raised_m` higher than it was recorded."""

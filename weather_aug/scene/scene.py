@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from weather_aug._checks import finite
 from weather_aug.clip.types import Camera, Clip, Frame, FrameKey, Window
 from weather_aug.edit.ambience import Ambience
+from weather_aug.edit.background import BackgroundEditor
 from weather_aug.edit.physical.layers import Layers
 from weather_aug.errors import ArgumentError, IntegrityError, printable
 from weather_aug.gaussians.types import Reconstruction
 from weather_aug.particles.shelter import Shelter
-from weather_aug.render.compose import RenderedFrame, render
+from weather_aug.render.compose import RenderedFrame
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene import store
+from weather_aug.scene.backdrop import read_background
 from weather_aug.scene.layers import Street, layers_seen
 from weather_aug.scene.reconstruction import read_reconstruction
-from weather_aug.scene.records import FrameRecord, Manifest, rig_motion, streets
-from weather_aug.scene.styles import carried_options, lying_in
-from weather_aug.scene.viewpoint import Viewpoint, raised_height_m
+from weather_aug.scene.records import FrameRecord, Manifest, streets
+from weather_aug.scene.rendering import Asked, Drive, dressed, over_stored
+from weather_aug.scene.styles import PHYSICAL, carried_options, lying_in, weights_asked, weights_of
+from weather_aug.scene.viewpoint import raised_height_m
 from weather_aug.timeline import WeatherTimeline
 from weather_aug.weather import Weather
 
@@ -31,10 +36,11 @@ if TYPE_CHECKING:
     from weather_aug.gaussians.gather import Weights
     from weather_aug.gaussians.options import FitOptions
     from weather_aug.scene.novel import NovelFrame, Poses
+    from weather_aug.scene.viewpoint import Viewpoint
 
 
 class WeatherScene:
-    """A clip precomputed for weather: pictures, depth, labels, cameras, light, Gaussians on disk.
+    """A clip precomputed for weather: pictures, depth, labels, backgrounds, Gaussians on disk.
 
     Convention:
         A scene is immutable and holds only its folder's path: it opens lazily, and pickles to a
@@ -74,8 +80,9 @@ class WeatherScene:
         clip: Clip,
         out: str | Path,
         *,
-        editor: str = "physical",
-        weathers: Sequence[str] = ("rain", "snow", "fog"),
+        editor: str | BackgroundEditor = PHYSICAL,
+        editor_options: Any = None,
+        weathers: Sequence[str] | None = None,
         progress: bool = False,
         overwrite: bool = False,
         reconstruct: bool = False,
@@ -87,8 +94,11 @@ class WeatherScene:
         Args:
             clip: The drive; every frame needs depth.
             out: Folder to make.
-            editor: How backgrounds get their weather.
-            weathers: Types the scene is meant for.
+            editor: How backgrounds get their weather: "physical" while rendering; a
+                `BackgroundEditor`, or the name of one in `edit.editors.EDITORS`, now.
+            editor_options: Of an editor that is named, such as `DiffusionOptions`.
+            weathers: Types the scene is meant for, and which backgrounds of an editor are stored;
+                all that it knows if None.
             progress: Show bars.
             overwrite: Replace `out` if it is a scene already.
             reconstruct: Turn the frames into Gaussians as well, so that they can be rendered from
@@ -100,19 +110,17 @@ class WeatherScene:
             ArgumentError: If `reconstruction` is given without `reconstruct`, or a choice is none.
         """
         from weather_aug.scene.build import build
+        from weather_aug.scene.reconstruct import wanted_of
 
         if reconstruction is not None and not reconstruct:
             raise ArgumentError("reconstruction means nothing without reconstruct=True")
-        wanted = None
-        if reconstruct:
-            from weather_aug.scene.reconstruct import wanted_of
-
-            wanted = wanted_of(reconstruction, styles)
+        wanted = wanted_of(reconstruction, styles) if reconstruct else None
         build(
             *(clip, Path(out), editor, weathers),
             progress=progress,
             overwrite=overwrite,
             wanted=wanted,
+            editor_options=editor_options,
         )
         return cls.load(out)
 
@@ -149,6 +157,16 @@ class WeatherScene:
             SceneError: If a file of it cannot be read any more.
         """
         return store.read_frame(self.path, self._record(key))
+
+    def background(self, key: FrameKey, style: str) -> NDArray[np.uint8]:
+        """(H, W, 3) sRGB of a recorded frame in a style, as the scene's editor made it.
+
+        Raises:
+            ArgumentError: If the scene has no such frame, or no backgrounds in that style.
+            SceneError: If its file cannot be read any more.
+        """
+        weights_of(style, 1.0, self.manifest.styles)
+        return read_background(self.path, self._record(key), style)
 
     def ambience(self, key: FrameKey) -> Ambience:
         """Light around a frame; the axes are the clip's.
@@ -198,7 +216,7 @@ class WeatherScene:
 
     def _looked_at(self, frame: Frame, *, novel: bool = False) -> Layers:
         street = self._streets[frame.key.camera]
-        height_m = raised_height_m(street.camera_height_m, self._raised_m(frame))
+        height_m = raised_height_m(street.camera_height_m, self.manifest.raised_m(frame))
         mirrored = None
         if self.reconstruction is not None:
             # Loads torch.
@@ -210,8 +228,7 @@ class WeatherScene:
     @cached_property
     def _streets(self) -> dict[str, Street]:
         manifest = self.manifest
-        is_drive = manifest.airlight is not None
-        return streets(manifest.frames, manifest.axes_world, is_drive=is_drive)
+        return streets(manifest.frames, manifest.axes_world, is_drive=manifest.is_drive)
 
     def render(
         self,
@@ -230,13 +247,18 @@ class WeatherScene:
     ) -> RenderedFrame:
         """Render one frame in a weather; see `weather_aug.render.compose.render`.
 
-        A viewpoint, a style, or actors that are left out or put elsewhere make it a frame that was
-        never recorded, drawn from the scene's Gaussians (see `frame_from`): what no recorded frame
-        showed has the label 255, and is invalid. There are two ways to its background. Without a
-        style the editor dresses the picture, as it does recorded ones. A style shows its weather
+        A viewpoint, a style that is not stored, or actors that are left out or put elsewhere make
+        it a frame that was never recorded, drawn from the scene's Gaussians (see `frame_from`):
+        what no recorded frame showed has the label 255, and is invalid.
+
+        There are two ways to the background. In a scene of the physical editor, and with
+        `style="physical"` in any, that editor dresses the picture. A style shows its weather
         already: the effects on surfaces (`scene.styles.CARRIED`) are left out, whatever the weather
         says of the ground; air, particles, light on them, spray, lamps, glass and sensor follow the
-        weather, and labels are buried under the style's snow.
+        weather, and labels are buried under the style's snow. Where another editor stored
+        backgrounds, the weather itself tells how much of each style is shown, by
+        `scene.styles.style_amounts`: of the stored pictures in linear light, or of the Gaussians
+        that were fitted to them. What none of the styles shows is then not on the ground.
 
         Args:
             key: Which frame, one of `keys`.
@@ -246,8 +268,10 @@ class WeatherScene:
             air: How the air moves and has moved since the clip's start; if None, as the weather
                 tells.
             viewpoint: Where the camera stands, from the recorded one.
-            style: A weather's colours that the Gaussians take, or weights of several.
-            amount: In 0..1, of the style.
+            style: A weather whose stored background is shown, or whose colours the Gaussians take;
+                weights of several; or "physical". If None, as the weather asks.
+            amount: In 0..1, of the style, or of the styles that the weather asks for: 0 leaves the
+                recorded picture, and only its air is weather's.
             without_actors: Track ids of moving objects to leave out.
             poses: (4, 4) `world_from_actor` by track id: moving objects put elsewhere.
             options: Choices besides the weather.
@@ -258,50 +282,31 @@ class WeatherScene:
         """
         if not isinstance(options, RenderOptions):
             raise ArgumentError(f"options must be RenderOptions, got {type(options).__name__}")
-        if viewpoint is None and style is None and not without_actors and not poses:
-            look = self._layers_of
-            return self._rendered(self.frame(key), look, weather, seed, window, air, options)
+        asked = Asked(weather, seed, window, air, options)
+        drive = Drive(self.path, self.manifest, self.shelter, self._layers_of)
+        stored = () if style == PHYSICAL else self.manifest.styles
+        style = None if style == PHYSICAL else style
+        time_s = self._record(key).time_s - self.manifest.frames[0].time_s
+        if viewpoint is None and not without_actors and not poses:
+            names = {style} if isinstance(style, str) else set(style or ())
+            if stored and (names <= set(stored) or self.reconstruction is None):
+                weights = weights_asked(weather, time_s, style, amount, stored)
+                return over_stored(drive, self.frame(key), weights, asked)
+            if style is None:
+                return dressed(drive, self.frame(key), asked)
+        fitted = [name for name in stored if name in self._gaussians().styles]
+        if style is None and fitted:
+            style, amount = weights_asked(weather, time_s, None, amount, fitted), 1.0
         # Loads torch.
         from weather_aug.scene.novel import honest
 
         shown = dict(style=style, amount=amount, without=without_actors, poses=poses)
-        # A style has its snow already; the editor asks where surfaces face up.
-        has_normals = style is None
-        novel = self._novel(key, viewpoint, None, None, normals=has_normals, **shown)
+        # A style has its snow already; the physical editor asks where surfaces face up.
+        novel = self._novel(key, viewpoint, None, None, normals=style is None, **shown)
         dressing = options if style is None else carried_options(options)
-        look = partial(self._looked_at, novel=True)
-        shot = self._rendered(novel.frame, look, weather, seed, window, air, dressing)
+        drive = drive._replace(look=partial(self._looked_at, novel=True))
+        shot = dressed(drive, novel.frame, asked._replace(options=dressing))
         return honest(shot, novel, lying_in(style, amount), options)
-
-    def _rendered(
-        self,
-        frame: Frame,
-        look: Callable[[Frame], Layers],
-        weather: Weather | WeatherTimeline,
-        seed: int,
-        window: Window | None,
-        air: Air | None,
-        options: RenderOptions,
-    ) -> RenderedFrame:
-        """A frame in a weather; `look` tells what the editor knows of it."""
-        frame = replace(frame, time_s=frame.time_s - self.manifest.frames[0].time_s)
-        if isinstance(weather, WeatherTimeline):
-            air = air or weather.air(frame.time_s, seed)
-            weather = weather.at(frame.time_s)
-        # A clear picture is returned as it is, and what is no weather is refused.
-        is_seen = isinstance(weather, Weather) and not weather.is_clear
-        return render(
-            frame,
-            weather,
-            seed=seed,
-            ambience=self.manifest.ambience(self._record(frame.key), self._raised_m(frame)),
-            window=window,
-            air=air,
-            shelter=self.shelter,
-            rig=rig_motion(self.manifest.frames, frame.key) if options.needs_rig else None,
-            layers=look(frame) if is_seen else None,
-            options=options,
-        )
 
     def frame_from(
         self,
@@ -359,9 +364,8 @@ class WeatherScene:
 
         reconstruction = self._gaussians()
         recorded = store.read_frame(self.path, self._record(key))
-        if camera is None:
-            axes_world = self.manifest.axes_world
-            camera = novel_camera(reconstruction, recorded, axes_world, viewpoint or Viewpoint())
+        place = (self.manifest.axes_world, viewpoint)
+        camera = camera or novel_camera(reconstruction, recorded, *place)
         time_s = recorded.time_s if time_s is None else finite("time_s", time_s)
         want = PLANES if normals else PLANES[:-1]
         return novel_frame(reconstruction, recorded, camera, time_s, want=want, **shown)
@@ -373,11 +377,6 @@ class WeatherScene:
                 "with reconstruct=True (weather-aug build … --reconstruct)"
             )
         return self.reconstruction
-
-    def _raised_m(self, frame: Frame) -> float:
-        """How much higher a frame's camera stands than the recorded one."""
-        here, there = frame.camera, self._record(frame.key).camera
-        return float(self.manifest.axes_world[2] @ (here.centre_world - there.centre_world))
 
     def damaged_files(self) -> list[str]:
         """Compare every file with its digest; one sentence for each that has changed."""

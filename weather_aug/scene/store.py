@@ -6,6 +6,7 @@
     frames/000012_front.label.npy       (H, W) uint8 train ids, where the clip is labelled
     frames/000012_front.boxes.json      tracked boxes, where there are any
     frames/000012_front.layers.npy …    what the editor knows of it; see `weather_aug.scene.layers`
+    backgrounds/snow/000012_front.png   the picture in a style, where an editor made them before
     shelter.npy                         (A, L) float32 undersides over the street, if there are any
     gaussians/…                         the drive as Gaussians, if they were asked for; see
                                         `weather_aug.scene.reconstruction`
@@ -35,6 +36,7 @@ from weather_aug.edit.physical.layers import Layers
 from weather_aug.errors import ArgumentError, DataError, IntegrityError, SceneError, printable
 from weather_aug.particles.shelter import Shelter
 from weather_aug.scene.arrays import mapped, npy_bytes
+from weather_aug.scene.backgrounds_record import parse_backgrounds
 from weather_aug.scene.boxes import encode_boxes, read_boxes
 from weather_aug.scene.layers import PARTS as LAYER_PARTS
 from weather_aug.scene.layers import read_layers as stored_layers
@@ -61,7 +63,7 @@ FORMAT = "weather_aug scene"
 VERSION = 1
 MANIFEST = "scene.json"
 MAX_FRAMES = 20_000
-MAX_MANIFEST_BYTES = 96 * 2**20
+MAX_MANIFEST_BYTES = 112 * 2**20
 """More than MAX_FRAMES entries of the longest names take, so that what is built can be opened."""
 
 _DEPTH, _LABEL, _COVER = "<f2", "|u1", "<f4"
@@ -201,7 +203,7 @@ def read_frame(folder: Path, record: FrameRecord) -> Frame:
     Raises:
         SceneError: If a file of it cannot be read.
     """
-    image = _picture(folder / record.files["image"], record.camera)
+    image = read_picture(folder / record.files["image"], record.camera)
     depth, label = read_surfaces(folder, record)
     boxes = read_boxes(folder / record.files["boxes"]) if "boxes" in record.files else ()
     return Frame(record.key, record.time_s, record.camera, image, label, depth, boxes=boxes)
@@ -266,7 +268,12 @@ def _check_label(frame: Frame) -> None:
         )
 
 
-def _picture(path: Path, camera: Camera) -> NDArray[np.uint8]:
+def read_picture(path: Path, camera: Camera) -> NDArray[np.uint8]:
+    """(H, W, 3) sRGB of a camera's size.
+
+    Raises:
+        SceneError: If the file is no PNG of that size.
+    """
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -316,15 +323,17 @@ def manifest_of(content: Mapping[str, Any]) -> Manifest:
         str(relative): StoredFile(int(entry["size"]), str(entry["sha256"]))
         for relative, entry in content["files"].items()
     }
+    frames = tuple(parse_frame(entry) for entry in content["frames"])
     return Manifest(
         name=check_name("name", content["name"]),
         editor=check_name("editor", content["editor"]),
         weathers=tuple(check_name("weather", name) for name in content["weathers"]),
         axes_world=axes_of(content["axes_world"]),
         airlight=None if content["airlight"] is None else light_of(content["airlight"]),
-        frames=tuple(parse_frame(entry) for entry in content["frames"]),
+        frames=frames,
         files=files,
         shelter=parse_shelter(content.get("shelter"), files),
         # Scenes of before there were any, or built without, have none.
         reconstruction=parse_reconstruction(content.get("reconstruction"), files),
+        backgrounds=parse_backgrounds(content.get("backgrounds"), frames, files),
     )

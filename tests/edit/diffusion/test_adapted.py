@@ -14,6 +14,7 @@ from small_base import adapted, perturbed, pictures
 
 from weather_aug.edit.diffusion.adapted import SET, AdaptedModel, FullConv
 from weather_aug.edit.diffusion.base import load_base
+from weather_aug.edit.diffusion.checkpointing import enable_checkpointing
 from weather_aug.edit.diffusion.skips import decode, encode
 from weather_aug.edit.diffusion.spec import CLEAR, PROMPTS, AdapterSpec
 from weather_aug.errors import ArgumentError, DataError
@@ -150,10 +151,14 @@ def test_what_was_active_is_active_again_after_an_error(model: AdaptedModel) -> 
         assert torch.equal(model.noise(latent, prompt), before)
 
 
-def test_only_the_chosen_set_and_the_shared_parts_learn(small_base: Path) -> None:
-    model = adapted(small_base)
-    with model.styled("rain"):
-        learning = {name for name, p in model.named_parameters() if p.requires_grad}
+def test_only_the_set_that_acted_and_the_shared_parts_get_gradients(small_base: Path) -> None:
+    """Also where others act by the time of the backward pass."""
+    image, label = pictures()
+    model = perturbed(adapted(small_base), seed=3)
+    out = model(image, label, "rain")
+    with model.styled("snow"):
+        out.square().mean().backward()
+    learning = {name for name, p in model.named_parameters() if p.grad is not None}
     assert learning == {
         name
         for name in model.trained()
@@ -161,7 +166,6 @@ def test_only_the_chosen_set_and_the_shared_parts_learn(small_base: Path) -> Non
         or f".{SET.format('rain')}." in name
         or name.startswith("unet.conv_in.change.")
     }
-    assert any(f".{SET.format('rain')}." in name for name in learning)
 
 
 @settings(max_examples=30, deadline=None)
@@ -210,7 +214,8 @@ def test_checkpointing_changes_no_gradient(small_base: Path) -> None:
     gradients = []
     for checkpointing in (False, True):
         model = perturbed(adapted(small_base), seed=3)
-        model.checkpointing = checkpointing
+        if checkpointing:
+            enable_checkpointing(model)
         model(image, label, "snow").square().mean().backward()
         gradients.append({k: p.grad for k, p in model.trained().items() if p.grad is not None})
     assert gradients[0].keys() == gradients[1].keys() and gradients[0]

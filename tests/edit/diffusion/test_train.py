@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,7 +17,7 @@ from typing import Any
 import cv2
 import pytest
 import torch
-from pair_folder import STYLES, write_pair_folder
+from pair_folder import write_pair_folder
 
 from weather_aug import _files
 from weather_aug.edit.diffusion import learner as learner_module
@@ -47,6 +48,9 @@ OPTIONS = TrainOptions(
 )
 
 
+STYLES = ("rain", "snow")
+
+
 @dataclass(frozen=True)
 class Made:
     """A training that was never cut short."""
@@ -59,9 +63,34 @@ class Made:
 @pytest.fixture(scope="module")
 def made(small_base: Path, tmp_path_factory: pytest.TempPathFactory) -> Made:
     folder = tmp_path_factory.mktemp("training")
-    pairs = write_pair_folder(folder / "pairs")
+    pairs = write_pair_folder(folder / "pairs", styles=STYLES)
     report = train_editor(pairs, str(small_base), folder / "out", OPTIONS, progress=False)
     return Made(report, pairs, small_base)
+
+
+@pytest.fixture(scope="module")
+def cut_short(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where a training stopped before its fourth step; the state on disk is of the second."""
+    out = tmp_path_factory.mktemp("cut") / "out"
+    learn = Learner.step
+
+    def stopped(self: Learner, number: int, batch: Any) -> Any:
+        if number == 3:
+            raise KeyboardInterrupt
+        return learn(self, number, batch)
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Learner, "step", stopped)
+        train_editor(made.pairs, str(made.base), out, OPTIONS, progress=False)
+    assert [path.name for path in out.parent.iterdir()] == ["out.training"]
+    return out.parent
+
+
+@pytest.fixture
+def out(cut_short: Path, tmp_path: Path) -> Path:
+    """Of a training that was cut short, to go on with."""
+    shutil.copytree(cut_short, tmp_path / "run")
+    return tmp_path / "run" / "out"
 
 
 def content(folder: Path) -> dict[str, str]:
@@ -101,35 +130,15 @@ def test_what_is_made(made: Made) -> None:
 
     log = train_state.read_log(folder)
     assert [entry["step"] for entry in log if "losses" in entry] == [1, 2, 3, 4, 5]
-    assert sorted(entry["style"] for entry in log[:2] + log[3:5]) == sorted(STYLES)
+    assert sorted(entry["style"] for entry in log[:2]) == sorted(STYLES)
     assert [entry["step"] for entry in log if "validation" in entry] == [2, 4, 5]
     assert made.report.steps == 5 and made.report.resumed_at == 0
     assert made.report.sample.is_file()
-    assert cv2.imread(str(made.report.sample)).shape == (4 * (22 + 128 + 4), 3 * 196 - 4, 3)
+    assert cv2.imread(str(made.report.sample)).shape == (2 * (22 + 128 + 4), 3 * 196 - 4, 3)
 
 
-def interrupted(made: Made, out: Path, step: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Train until a step that does not come."""
-    learn = Learner.step
-
-    def stopped(self: Learner, number: int, batch: Any) -> Any:
-        if number == step:
-            raise KeyboardInterrupt
-        return learn(self, number, batch)
-
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(Learner, "step", stopped)
-        train_editor(made.pairs, str(made.base), out, OPTIONS, progress=False)
-    assert not out.exists()
-    assert not out.with_name(out.name + train_state.LOCK_SUFFIX).exists()
-
-
-def test_cut_short_it_goes_on_to_the_bit(
-    made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cut_short_it_goes_on_to_the_bit(made: Made, out: Path) -> None:
     """The third step, done once already, is done and logged again from the second's state."""
-    out = tmp_path / "again" / "out"
-    interrupted(made, out, 3, monkeypatch)
     report = train_editor(made.pairs, str(made.base), out, OPTIONS, progress=False)
     assert report.resumed_at == 2
     assert content(out) == content(made.report.folder)
@@ -138,9 +147,8 @@ def test_cut_short_it_goes_on_to_the_bit(
 
 @pytest.mark.parametrize("fault", ["moments", "batches"])
 def test_that_test_sees_what_is_not_taken_up(
-    made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str
+    made: Made, out: Path, monkeypatch: pytest.MonkeyPatch, fault: str
 ) -> None:
-    interrupted(made, tmp_path / "out", 3, monkeypatch)
     if fault == "moments":
         monkeypatch.setattr(learner_module, "load_optimiser", lambda *_: None)
     else:
@@ -151,9 +159,8 @@ def test_that_test_sees_what_is_not_taken_up(
             return batches(pair_list, replace(options, steps=options.steps - first_step))
 
         monkeypatch.setattr(train, "batches", from_the_start)
-    train_editor(made.pairs, str(made.base), tmp_path / "out", OPTIONS, progress=False)
-    ours, theirs = content(tmp_path / "out"), content(made.report.folder)
-    assert ours[WEIGHTS] != theirs[WEIGHTS]
+    train_editor(made.pairs, str(made.base), out, OPTIONS, progress=False)
+    assert content(out)[WEIGHTS] != content(made.report.folder)[WEIGHTS]
 
 
 @pytest.mark.slow
@@ -181,13 +188,10 @@ def test_killed_at_any_moment_it_ends_in_the_same_bytes(made: Made, tmp_path: Pa
 def test_an_adapter_that_is_whole_is_only_put_in_its_place(
     made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def cut_short(work: Path, out: Path) -> None:
-        raise KeyboardInterrupt
-
+    """What a kill leaves after the card was written: everything, and maybe the state."""
     out = tmp_path / "out"
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(train_state, "publish", cut_short)
-        train_editor(made.pairs, str(made.base), out, OPTIONS, progress=False)
+    shutil.copytree(made.report.folder, tmp_path / "out.training")
+    (tmp_path / "out.training" / train_state.STATE).write_bytes(b"cut sho")
     monkeypatch.setattr(train, "Learner", None)
     report = train_editor(made.pairs, str(made.base), out, OPTIONS, progress=False)
     assert report.resumed_at == OPTIONS.steps
@@ -195,18 +199,15 @@ def test_an_adapter_that_is_whole_is_only_put_in_its_place(
     assert content(out) == content(made.report.folder)
 
 
-def test_unfinished_work_of_another_training_is_refused(
-    made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "out"
-    interrupted(made, out, 2, monkeypatch)
-    before = content(tmp_path)
+def test_unfinished_work_of_another_training_is_refused(made: Made, out: Path) -> None:
+    before = content(out.parent)
     other = replace(OPTIONS, seed=1, learning_rate=2e-3)
-    with pytest.raises(ConflictError, match=r"learning_rate was 0.001, is 0.002; .*seed was 0"):
+    message = r"learning_rate was 0.001, is 0.002; .*seed was 0, is 1; give the same command"
+    with pytest.raises(ConflictError, match=message):
         train_editor(made.pairs, str(made.base), out, other, progress=False)
-    assert content(tmp_path) == before
+    assert content(out.parent) == before
 
-    state = tmp_path / "out.training" / train_state.STATE
+    state = out.parent / "out.training" / train_state.STATE
     state.write_bytes(state.read_bytes()[:-100])
     with pytest.raises(DataError, match="is damaged"):
         train_editor(made.pairs, str(made.base), out, OPTIONS, progress=False)

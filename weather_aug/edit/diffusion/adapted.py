@@ -52,8 +52,8 @@ class AdaptedModel(nn.Module):
 
     Convention:
         Owns the base it is given and adds layers to its networks; the base's own weights stay as
-        they are, frozen. Which styles act is chosen by `styled` around a call. Trainable are the
-        parts that all styles share, and of the low-rank sets those of the chosen styles.
+        they are, frozen. Which styles act is chosen by `styled` around a call. Trainable, unless it
+        is `frozen`, is all that the adapter consists of; gradients reach the sets that acted.
 
     Args:
         base: Used up: load another for another adapter.
@@ -84,7 +84,11 @@ class AdaptedModel(nn.Module):
             self.unet.conv_in = FullConv(self.unet.conv_in)
         embedded = base.embed([spec.prompts[style] for style in spec.styles])
         self.register_buffer("prompts", embedded, persistent=False)
-        self._activate({spec.styles[0]: 1.0})
+        self._sets = [p for name, p in self.unet.named_parameters() if ".lora_" in name]
+        self._open: list[dict[str, float]] = []
+        self._active: dict[str, float] = {}
+        for parameter in self.trained().values():
+            parameter.requires_grad_(True)
 
     @property
     def device(self) -> torch.device:
@@ -95,6 +99,11 @@ class AdaptedModel(nn.Module):
     def dtype(self) -> torch.dtype:
         """Of its activations."""
         return self.get_buffer("prompts").dtype
+
+    @property
+    def acting(self) -> dict[str, float]:
+        """Weights by style of the sets that act now."""
+        return dict(self._active)
 
     def forward(
         self, image: torch.Tensor, label: torch.Tensor | None, style: str | Mapping[str, float]
@@ -137,7 +146,7 @@ class AdaptedModel(nn.Module):
 
     @contextmanager
     def styled(self, style: str | Mapping[str, float]) -> Iterator[torch.Tensor]:
-        """Let styles act inside the block; what they were before acts again after it.
+        """Let styles act inside the block; those of a block around it act again after it.
 
         Args:
             style: Its name, or weights by name that sum to at most 1; what is missing to 1 is the
@@ -150,16 +159,18 @@ class AdaptedModel(nn.Module):
             ArgumentError: If a style is none of the adapter's, or weights are none.
         """
         weights = self.weights_of(style)
-        before = self._active
-        self._activate(weights)
+        self._open.append(weights)
         try:
+            self._activate(weights)
             rows = [self.spec.styles.index(name) for name in weights]
             shares = torch.tensor(list(weights.values()), device=self.device)
             shares = (shares / shares.sum())[:, None, None]
             prompts = self.get_buffer("prompts")[rows]
             yield (shares.to(prompts.dtype) * prompts).sum(0)
         finally:
-            self._activate(before)
+            self._open.pop()
+            if self._open:
+                self._activate(self._open[-1])
 
     def weights_of(self, style: str | Mapping[str, float]) -> dict[str, float]:
         """Weights by style, of a name or a blend; see `styled`.
@@ -225,19 +236,18 @@ class AdaptedModel(nn.Module):
     def frozen(self) -> AdaptedModel:
         """The same model, which from now on only draws."""
         self.learns = False
-        self._activate(self._active)
+        for parameter in self.trained().values():
+            parameter.requires_grad_(False)
         return self.eval()
 
     def _activate(self, weights: Mapping[str, float]) -> None:
+        if weights == self._active:
+            return
         self._active = dict(weights)
-        active = [SET.format(style) for style in weights]
-        self.unet.set_adapters(active, list(weights.values()))
-        for name, parameter in self.trained().items():
-            if name.startswith("unet.") and ".lora_" in name:
-                chosen = any(f".{name_of}." in name for name_of in active)
-                parameter.requires_grad_(self.learns and chosen)
-            else:
-                parameter.requires_grad_(self.learns)
+        self.unet.set_adapters([SET.format(style) for style in weights], list(weights.values()))
+        # The library freezes the sets that do not act, and gradients of those that acted with them.
+        for parameter in self._sets:
+            parameter.requires_grad_(self.learns)
 
 
 def _add_low_rank(network: Any, name: str, targets: Sequence[str], rank: int, alpha: float) -> None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import torch
 
 from weather_aug._extras import require
 from weather_aug.edit.diffusion.one_step import LAST_STEP
-from weather_aug.edit.weights import digest_of, is_model_id, located
+from weather_aug.edit.weights import digest_of, is_model_id, located, readable
 from weather_aug.errors import DataError, printable
 
 PARTS = ("unet", "vae", "text_encoder", "tokenizer", "scheduler")
@@ -60,7 +59,7 @@ class Base:
             DataError: If the text encoder's files cannot be read.
         """
         transformers = require("transformers", extra="edit", to=TO)
-        with _readable(self.folder):
+        with readable(self.folder):
             tokenizer = transformers.CLIPTokenizer.from_pretrained(
                 self.folder / "tokenizer", local_files_only=True
             )
@@ -93,7 +92,7 @@ def load_base(base: str) -> Base:
     diffusers = require("diffusers", extra="edit", to=TO)
     needs = [f"{part}/config.json" for part in ("unet", "vae", "text_encoder")]
     folder = located(base, to=TO, what=WHAT, needs=[*needs, "scheduler/scheduler_config.json"])
-    with _readable(folder):
+    with readable(folder):
         unet = diffusers.UNet2DConditionModel.from_pretrained(
             folder / "unet", local_files_only=True, use_safetensors=True
         )
@@ -130,17 +129,3 @@ def _check(folder: Path, unet: Any, vae: Any, schedule: Any) -> None:
             f"{printable(folder, 200)}: the UNet maps {unet.config.in_channels} channels to "
             f"{unet.config.out_channels}, the VAE's latent has {latent}; they are not of one model"
         )
-
-
-@contextmanager
-def _readable(folder: Path) -> Iterator[None]:
-    """What the libraries raise on files that are not theirs, as one typed sentence."""
-    try:
-        yield
-    except DataError:
-        raise
-    except Exception as error:
-        raise DataError(
-            f"{printable(folder, 200)} is no model that can be read: "
-            f"{type(error).__name__} {printable(error, 300)}"
-        ) from error

@@ -56,7 +56,9 @@ class LabelStem(nn.Module):
         )
         nn.init.zeros_(self.conv.weight)
         if kind == "embedding":
-            self.embedding = nn.Embedding(len(CLASSES) + 1, EMBEDDED)
+            # What is unknown adds nothing, as no label at all does.
+            unknown = len(CLASSES)
+            self.embedding = nn.Embedding(unknown + 1, EMBEDDED, padding_idx=unknown)
         else:
             self.register_buffer("table", _table(kind), persistent=False)
 

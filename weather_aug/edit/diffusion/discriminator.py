@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -15,8 +14,8 @@ from torch.nn.utils.parametrizations import spectral_norm
 from weather_aug._extras import require
 from weather_aug._keys import key_of
 from weather_aug.edit.diffusion.adapted import SET
-from weather_aug.edit.weights import located
-from weather_aug.errors import ArgumentError, DataError, printable
+from weather_aug.edit.weights import located, readable
+from weather_aug.errors import ArgumentError, printable
 
 DiscriminatorKind = Literal["patch", "clip"]
 Logits = tuple[torch.Tensor, ...]
@@ -179,7 +178,7 @@ def load_clip(source: str | Path) -> Any:
     transformers = require("transformers", extra="edit", to=TO)
     what = "the CLIP model of the discriminators"
     folder = located(source, to=TO, what=what, needs=("config.json", "model.safetensors"))
-    with _readable(folder):
+    with readable(folder):
         model = transformers.CLIPVisionModel.from_pretrained(
             folder, local_files_only=True, use_safetensors=True
         )
@@ -243,15 +242,3 @@ def _forget_backbone(module: nn.Module, state: dict[str, Any], prefix: str, *_: 
 def _recall_backbone(module: Any, state: dict[str, Any], prefix: str, *_: Any) -> None:
     own = module.backbone.state_dict()
     state.update({f"{prefix}backbone.{name}": tensor for name, tensor in own.items()})
-
-
-@contextmanager
-def _readable(folder: Path) -> Iterator[None]:
-    """What the library raises on files that are not its own, as one typed sentence."""
-    try:
-        yield
-    except Exception as error:
-        raise DataError(
-            f"{printable(folder, 200)} is no CLIP model that can be read: "
-            f"{type(error).__name__} {printable(error, 300)}"
-        ) from error

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import nn
-from torch.utils.checkpoint import checkpoint
 
 from weather_aug._extras import require
 from weather_aug._keys import key_of
 from weather_aug.edit.diffusion.adapted import AdaptedModel
 from weather_aug.edit.diffusion.base import Base
+from weather_aug.edit.diffusion.checkpointing import enable_checkpointing
 from weather_aug.edit.diffusion.discriminator import Discriminators, make_discriminators
 from weather_aug.edit.diffusion.objectives import (
     CycleWeights,
@@ -110,7 +110,7 @@ class Learner:
         self.model = AdaptedModel(base, spec, seed=_key("train.adapter", options.seed))
         self.model.to(accelerator.device)
         if options.gradient_checkpointing:
-            keep_less(self.model)
+            enable_checkpointing(self.model)
         self.perceptual = None
         if options.objective != "epsilon":
             self.perceptual = perceptual_distance(
@@ -341,28 +341,6 @@ class Learner:
                     f"take a learning_rate below {self.options.learning_rate:g}, or "
                     'mixed_precision "no"'
                 )
-
-
-def keep_less(model: AdaptedModel) -> None:
-    """Let a model compute activations again for the gradient instead of keeping them."""
-
-    def checkpointed(module: Any, *args: Any) -> Any:
-        # The gradient may be computed when other styles act than did at first.
-        acting = dict(model._active)
-
-        def run(*inputs: Any) -> Any:
-            if model._active == acting:
-                return module(*inputs)
-            with model.styled(acting):
-                out = module(*inputs)
-            for parameter in model.trained().values():
-                parameter.requires_grad_(True)
-            return out
-
-        return checkpoint(run, *args, use_reentrant=False)
-
-    model.checkpointing = True
-    model.unet.enable_gradient_checkpointing(checkpointed)
 
 
 def _add(sums: dict[str, float], losses: Losses, parts: int) -> None:

@@ -8,9 +8,7 @@ Convention:
 
     A loss function returns terms without weights, each a mean over the batch, by the names of the
     fields of its weights; a term of weight 0 is not computed. `weighted_sum` is what to lower.
-    Every function leaves the sets of the styles it used open to gradients until styles are
-    switched again, because autograd drops at the backward pass what is frozen by then: call
-    `backward` before anything else. Nothing draws from a stream of torch's own.
+    Nothing draws from a stream of torch's own.
 """
 
 from __future__ import annotations
@@ -18,12 +16,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch
 from torch.nn import functional
 
 from weather_aug._checks import finite
-from weather_aug.edit.diffusion.adapted import SET, AdaptedModel
+from weather_aug.edit.diffusion.adapted import AdaptedModel
 from weather_aug.edit.diffusion.discriminator import (
     Discriminators,
     discriminator_loss,
@@ -35,6 +34,9 @@ from weather_aug.edit.diffusion.perceptual import BaseEncoder, PerceptualDistanc
 from weather_aug.edit.diffusion.skips import encode
 from weather_aug.edit.diffusion.spec import CLEAR
 from weather_aug.errors import ArgumentError, printable
+
+# Of each model one: making it costs as much as a small picture's encoding.
+_BASE_ENCODERS: WeakKeyDictionary[AdaptedModel, BaseEncoder] = WeakKeyDictionary()
 
 Batch = Mapping[str, Any]
 Losses = dict[str, torch.Tensor]
@@ -154,7 +156,6 @@ def paired_losses(
             losses["l1"] = functional.l1_loss(image.float(), target.float())
         if perceptual is not None:
             losses["perceptual"] = perceptual(image, target).mean()
-    _open(model, style)
     return losses
 
 
@@ -193,7 +194,6 @@ def epsilon_losses(
     if weights.latent > 0:
         wanted = base_latent(model, target)
         losses["latent"] = functional.mse_loss(latent.float(), wanted.float())
-    _open(model, style)
     return losses
 
 
@@ -223,8 +223,7 @@ def generator_losses(
         generator: Not used, nothing is drawn; the other objectives have one.
 
     Returns:
-        By the names of the weights. The peak of memory is that of six passes through the model;
-        `generator_parts` needs two.
+        By the names of the weights. Memory is that of six passes; `generator_parts` needs two.
 
     Raises:
         ArgumentError: If the model has no style "clear", the batch is of it, or a network that a
@@ -234,7 +233,6 @@ def generator_losses(
     for part in generator_parts(model, batch, weights, perceptual, discriminators, generator):
         for name, loss in part.items():
             losses[name] = losses[name] + loss if name in losses else loss
-    _open(model, batch["style"], CLEAR)
     return losses
 
 
@@ -248,10 +246,8 @@ def generator_parts(
 ) -> Iterator[Losses]:
     """`generator_losses` in parts that sum to them, one direction of one kind after the other.
 
-    A backward pass for each part before the next is asked for adds up to the same gradients, with
-    the memory of two passes through the model.
-
-    Args, Raises: As `generator_losses`.
+    Backward passes of each part before the next is asked for add up to the same gradients, with
+    the memory of two passes.
     """
     _check_cycle(model, batch, discriminators)
     if weights.adversarial > 0 and discriminators is None:
@@ -264,13 +260,11 @@ def generator_parts(
             model, image, label, (there, back), weights, perceptual, discriminators
         )
         if cycle:
-            _open(model, there, back)
             yield cycle
     if weights.identity_l1 > 0 or weights.identity_perceptual > 0:
         for _, own, image, label in _directions(batch):
             pair = weights.identity_l1, weights.identity_perceptual
             part = _compared("identity", model(image, label, own), image, pair, perceptual)
-            _open(model, own)
             yield part
 
 
@@ -308,8 +302,10 @@ def discriminator_losses(
 
 def base_latent(model: AdaptedModel, image: torch.Tensor) -> torch.Tensor:
     """(B, 4, h, w) of (B, 3, H, W) by the base's own encoder: no adapter, label or gradient."""
+    if model not in _BASE_ENCODERS:
+        _BASE_ENCODERS[model] = BaseEncoder(model.vae)
     with torch.no_grad():
-        return encode(BaseEncoder(model.vae), image).latent
+        return encode(_BASE_ENCODERS[model], image).latent
 
 
 def _directions(batch: Batch) -> tuple[tuple[str, str, torch.Tensor, torch.Tensor], ...]:
@@ -333,7 +329,6 @@ def _there_and_back(
     perceptual: PerceptualDistance | None,
     discriminators: Discriminators | None,
 ) -> Losses:
-    """Terms of a picture edited into a style and back again."""
     there, back = ways
     returns = weights.cycle_l1 > 0 or weights.cycle_perceptual > 0
     if not returns and weights.adversarial == 0:
@@ -371,7 +366,6 @@ def _compared(
 
 
 def _given(perceptual: PerceptualDistance | None, weight: float) -> PerceptualDistance | None:
-    """The distance if its weight asks for it."""
     if weight == 0:
         return None
     if perceptual is None:
@@ -395,11 +389,3 @@ def _check_cycle(model: AdaptedModel, batch: Batch, discriminators: Discriminato
                 f"a cycle needs the style {printable(name)!r}, of the adapter and with a "
                 "discriminator; add it or train with paired or epsilon"
             )
-
-
-def _open(model: AdaptedModel, *styles: str) -> None:
-    """Let gradients into the sets of styles that may not act any more; see the Convention."""
-    names = [f".{SET.format(style)}." for style in styles]
-    for name, parameter in model.trained().items():
-        if any(part in name for part in names):
-            parameter.requires_grad_(True)

@@ -154,12 +154,8 @@ def _apart(ours: torch.Tensor, theirs: torch.Tensor) -> torch.Tensor:
 
 def _without_adapter(module: Any) -> Any:
     """The same layers over the same weights, each adapted one replaced by what it adapts."""
-    shared = {id(tensor): tensor for tensor in (*module.parameters(), *module.buffers())}
-    plain = copy.deepcopy(module, shared)
-    if hasattr(plain, "base_layer"):
-        return plain.base_layer
-    for parent in list(plain.modules()):
-        for name, child in list(parent.named_children()):
-            if hasattr(child, "base_layer"):
-                setattr(parent, name, child.base_layer)
-    return plain
+    memo: dict[int, Any] = {id(t): t for t in (*module.parameters(), *module.buffers())}
+    for layer in module.modules():
+        if hasattr(layer, "base_layer"):
+            memo[id(layer)] = copy.deepcopy(layer.base_layer, memo)
+    return copy.deepcopy(module, memo)

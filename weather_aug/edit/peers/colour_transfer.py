@@ -8,7 +8,7 @@ nothing flickers.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from weather_aug._files import sha256_of_file
 from weather_aug.clip.images import read_image
-from weather_aug.clip.types import Clip
+from weather_aug.clip.types import Clip, FrameKey
 from weather_aug.edit.background import STYLES, Moment
 from weather_aug.edit.peers.options import PeerOptions, check_style
 from weather_aug.edit.peers.pictures import levels
@@ -29,7 +29,7 @@ UInt8 = NDArray[np.uint8]
 Float32 = NDArray[np.float32]
 
 MOST_FRAMES = 64
-"""Of a clip that are measured, evenly spaced."""
+"""Of a clip that are measured, if no more cameras than that are at one time."""
 LEAST_SPREAD = 1.0
 """Standard deviation below which a channel is taken for one colour, of 100."""
 
@@ -71,7 +71,7 @@ class ColourTransfer:
 
         Args:
             options: Whose `pictures` is a folder.
-            clip: That will be edited; at most 64 of its frames are read.
+            clip: That will be edited; some 64 of its frames are read.
 
         Raises:
             ArgumentError: If an option is not of this peer, or folder or clip are not given.
@@ -81,7 +81,7 @@ class ColourTransfer:
         paths = style_pictures(options.pictures)
         if clip is None:
             raise ArgumentError("colour-transfer measures the clip that it edits; give clip=...")
-        keys = clip.keys[:: -(-len(clip.keys) // MOST_FRAMES)]
+        keys = sampled(clip.keys)
         pictures = {style: measured([read_image(path)]) for style, path in paths.items()}
         digests = {style: sha256_of_file(path) for style, path in paths.items()}
         return cls(
@@ -113,6 +113,14 @@ class ColourTransfer:
             lab = moved(lab_of(frame.image), self._clip, wanted)
             out.append(levels(cv2.cvtColor(lab, cv2.COLOR_LAB2RGB), frame.key))
         return tuple(out)
+
+
+def sampled(keys: Sequence[FrameKey]) -> tuple[FrameKey, ...]:
+    """At most `MOST_FRAMES` keys, of times evenly spaced and of all their cameras."""
+    times = sorted({key.time_index for key in keys})
+    cameras = -(-len(keys) // len(times))
+    kept = set(times[:: -(-len(times) // max(1, MOST_FRAMES // cameras))])
+    return tuple(key for key in keys if key.time_index in kept)
 
 
 def measured(pictures: Iterable[UInt8]) -> ColourStatistics:

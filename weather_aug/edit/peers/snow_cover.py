@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,13 +17,9 @@ from weather_aug.clip.types import Frame
 from weather_aug.edit.ambience import Ambience
 from weather_aug.edit.background import Moment
 from weather_aug.edit.peers.options import PeerOptions, check_style
-from weather_aug.edit.physical.dress import dress
-from weather_aug.edit.physical.edit import geometry_of, tone_tables
+from weather_aug.edit.physical.edit import dressed
 from weather_aug.edit.physical.layers import Layers
 from weather_aug.edit.physical.look import look_of
-from weather_aug.edit.physical.materials import material_table
-from weather_aug.edit.physical.noise import noise_tile
-from weather_aug.edit.surface import shared, surface_of
 from weather_aug.errors import ArgumentError
 from weather_aug.weather import Weather
 
@@ -99,23 +94,5 @@ def snowed(frame: Frame, layers: Layers, ambience: Ambience, weather: Weather) -
     look = look_of(weather, ambience, layers.illumination, frame.time_s, WITHOUT)
     # The physical editor's camera darkens all else between white fields.
     look = look._replace(exposure=np.float32(1.0))
-    labelled = frame.label is not None
-    height, width = frame.image.shape[:2]
-    out = np.empty((3, height, width), np.uint8)
-    dress(
-        np.stack(cv2.split(frame.image)),
-        surface_of(frame),
-        shared(layers.classes).reshape(-1),
-        (0, 0, height, width),
-        geometry_of(frame.camera, ambience.axes_world, layers.plane, labelled=labelled),
-        look,
-        shared(layers.tint),
-        tone_tables(0.0),
-        material_table(labelled=labelled),
-        shared(layers.maps.view(np.uint16)),
-        np.float32(layers.step),
-        noise_tile(),
-        out,
-    )
-    image: UInt8 = cv2.merge(tuple(out))
-    return image
+    window = (0, 0, *frame.image.shape[:2])
+    return dressed(frame, layers, ambience, window, look, overcast=0.0)

@@ -15,7 +15,7 @@ from weather_aug.edit.ambience import Ambience
 from weather_aug.edit.physical.dress import Geometry, dress
 from weather_aug.edit.physical.layer_rows import MOST_ROOT, TABLE_STEPS
 from weather_aug.edit.physical.layers import Layers
-from weather_aug.edit.physical.look import look_of
+from weather_aug.edit.physical.look import Look, look_of
 from weather_aug.edit.physical.materials import material_table
 from weather_aug.edit.physical.noise import PERIOD_M, noise_tile
 from weather_aug.edit.physical.overcast import tone
@@ -53,6 +53,31 @@ def edited(
         (H, W, 3) sRGB.
     """
     look = look_of(weather, ambience, layers.illumination, frame.time_s, without)
+    overcast = 0.0 if "relight" in without else weather.overcast
+    return dressed(frame, layers, ambience, window, look, overcast)
+
+
+def dressed(
+    frame: Frame,
+    layers: Layers,
+    ambience: Ambience,
+    window: Window,
+    look: Look,
+    overcast: float,
+) -> UInt8:
+    """Background of a window in a look; see `edited`.
+
+    Args:
+        frame: Picture with depth.
+        layers: Of the same frame.
+        ambience: Light and axes of the scene.
+        window: (top, left, height, width).
+        look: A weather, in the kernels' numbers.
+        overcast: In 0..1, that the tone follows.
+
+    Returns:
+        (H, W, 3) sRGB.
+    """
     labelled = frame.label is not None
     top, left, height, width = window
     out = np.empty((3, height, width), np.uint8)
@@ -65,7 +90,7 @@ def edited(
         geometry_of(frame.camera, ambience.axes_world, layers.plane, labelled=labelled),
         look,
         shared(layers.tint),
-        tone_tables(0.0 if "relight" in without else weather.overcast),
+        tone_tables(overcast),
         material_table(labelled=labelled),
         shared(layers.maps.view(np.uint16)),
         np.float32(layers.step),

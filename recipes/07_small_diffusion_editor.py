@@ -14,7 +14,7 @@ import argparse
 import tempfile
 from pathlib import Path
 
-from small_editor.measure import HeldOut, Row, measured_row, report
+from small_editor.measure import HeldOut, Row, measured_row, measured_targets, report
 from small_editor.stages import QUICK, Plan, prepared, trained
 from small_editor.streets import STYLES
 
@@ -41,7 +41,10 @@ ATTENTIONS = {
 
 def measured_all(plan: Plan, out: Path, streets: list[HeldOut], seeds: int) -> dict[str, list[Row]]:
     """Train and measure each editor; by name, one row of numbers for each seed."""
-    rows: dict[str, list[Row]] = {"clear": [measured_row(streets, None)]}
+    rows: dict[str, list[Row]] = {
+        "clear": [measured_row(streets, None)],
+        "physical editor": [measured_targets(streets)],
+    }
 
     def add(name: str, adapter: Path, attention: AttentionWeights = SELF_ONLY) -> None:
         row = measured_row(streets, editor_of(out, adapter, attention))
@@ -54,10 +57,11 @@ def measured_all(plan: Plan, out: Path, streets: list[HeldOut], seeds: int) -> d
             add(name, adapter, attention)
         words = (*words, "--conditioning", "none")
         add("without labels", trained(plan, out, f"unlabelled_{seed}", plan.steps, *words))
-    for style in STYLES:
+    for style in STYLES if plan.singles else ():
         # As many steps as the style has among those of all.
         trained(plan, out, f"single/{style}", plan.steps // 4, "--styles", style)
-    add("single styles", out / "single")
+    if plan.singles:
+        add("single styles", out / "single")
     return rows
 
 

@@ -113,6 +113,15 @@ def measured_row(
     return row
 
 
+def measured_targets(streets: Sequence[HeldOut]) -> dict[tuple[str, str], Measured]:
+    """Measure the physical editor's pictures: how steady are those that an editor is to make?"""
+    return {
+        (street.scene.name, style): measured(street, style, street.targets[style])
+        for street in streets
+        for style in STYLES
+    }
+
+
 def mean(row: Row, measure: str, style: str | None = None) -> float:
     """Mean over streets of the mean of a street; over all styles if none is given."""
     chosen = [m.values[measure].mean() for (_, s), m in row.items() if style in (None, s)]

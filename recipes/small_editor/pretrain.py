@@ -36,8 +36,8 @@ NOTE = (
 class Schedule:
     """How long, on how much."""
 
-    vae_steps: int = 3000
-    unet_steps: int = 1500
+    vae_steps: int = 4000
+    unet_steps: int = 3000
     batch: int = 8
     crop_px: tuple[int, int] = (48, 80)
     """(height, width) of what the VAE sees of a picture."""

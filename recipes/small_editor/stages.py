@@ -25,8 +25,10 @@ class Plan:
     """0.1 s apart."""
     size_px: tuple[int, int] = (160, 96)
     schedule: Schedule = field(default_factory=Schedule)
-    steps: int = 700
+    steps: int = 1200
     batch: int = 2
+    singles: bool = True
+    """Whether single-style adapters are trained, too."""
     threads: int = 1
     """Of one training; on more, small layers take no less time."""
 
@@ -35,6 +37,7 @@ QUICK = Plan(
     *(range(10, 11), 1, range(100, 102), 2, (48, 32)),
     schedule=Schedule(vae_steps=3, unet_steps=3, batch=2, crop_px=(16, 24)),
     steps=4,
+    singles=False,
 )
 
 
@@ -78,7 +81,7 @@ def flags(plan: Plan, out: Path) -> list[object]:
     return [
         *("--base", out / "base", "--size", height, width, "--batch-size", plan.batch),
         *("--learning-rate", 3e-4, "--warm-up", 50, "--clip", 1.0),
-        *("--unet-rank", 16, "--vae-rank", 8, "--threads", plan.threads),
+        *("--unet-rank", 16, "--vae-rank", 8, "--label-dropout", 0, "--threads", plan.threads),
         *("--weights", "l1=5", "epsilon=0.5", "perceptual=1"),
         *("--save-every", 10_000, "--sample-every", 0, "--validate-every", 0),
     ]

@@ -14,6 +14,7 @@ import argparse
 import tempfile
 from pathlib import Path
 
+import torch
 from small_editor.measure import HeldOut, Row, measured_row, measured_targets, report
 from small_editor.stages import QUICK, Plan, prepared, trained
 from small_editor.streets import STYLES
@@ -93,6 +94,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true")
     given = parser.parse_args()
     plan, seeds = (QUICK, 1) if given.quick else (Plan(), given.seeds)
+    torch.set_num_threads(plan.threads)
     with tempfile.TemporaryDirectory() as folder:
         out = given.out or Path(folder)
         streets = prepared(plan, out)

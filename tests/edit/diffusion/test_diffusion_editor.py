@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -234,27 +233,6 @@ def test_where_no_view_is_seen_nobody_asks_where_the_front_is(editor: DiffusionE
         editor.edit(Moment(ring), "snow")
     blind = with_options(editor, without=("view",))
     assert len(blind.edit(Moment(ring, look=look), "snow")) == 4
-
-
-def test_skips_are_kept_of_the_frames_of_now_alone(
-    editor: DiffusionEditor, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """They are the largest tensors of all."""
-    kept: list[weakref.ref[torch.Tensor]] = []
-    encode, noises = editor._encoded, editor._noises
-
-    def encoded(one: Frame) -> Encoded:
-        found = encode(one)
-        kept.append(weakref.ref(found.skips[0]))
-        return found
-
-    def counted(*given: Any) -> Any:
-        assert [ref() is not None for ref in kept] == [False] * 3 + [True] * 3 + [False] * 3
-        return noises(*given)
-
-    monkeypatch.setattr(editor, "_encoded", encoded)
-    monkeypatch.setattr(editor, "_noises", counted)
-    assert len(editor.edit(MOMENT, "snow")) == 3
 
 
 def test_labels_are_resized_as_in_training(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -29,6 +31,9 @@ from weather_aug.taxonomy import IGNORE
 
 UInt8 = NDArray[np.uint8]
 
+LATENTS_KEPT = 32
+"""By their pixels: more than three times of six cameras, a few MB."""
+
 
 class DiffusionEditor:
     """A `BackgroundEditor` on a one-step diffusion model and an adapter for all weathers.
@@ -52,6 +57,7 @@ class DiffusionEditor:
         dtype = torch.float16 if options.half else torch.float32
         self.model = model.to(device_of(options.device), dtype)
         self.attention = effective_weights(options)
+        self._latents: OrderedDict[bytes, torch.Tensor] = OrderedDict()
 
     @classmethod
     def load(cls, options: DiffusionOptions) -> DiffusionEditor | SingleStyleEditors:
@@ -126,22 +132,16 @@ class DiffusionEditor:
             DataError: If the cameras' pictures have different sizes and are to look at each other.
         """
         window = self._window(moment)
-        frames = [frame for frames in window for frame in frames]
-        first_now = len(window[0])
-        now = range(first_now, first_now + len(moment.now))
         with torch.inference_mode(), self.model.styled(style) as prompt:
-            # Of frames before and after nothing is drawn, and skips are the largest tensors of all.
-            encoded = [
-                self._encoded(frame) if index in now else Encoded(self._encoded(frame).latent, ())
-                for index, frame in enumerate(frames)
-            ]
-            latents = [one.latent for one in encoded]
-            noises = self._noises(latents, prompt, window, self._reference_of(moment))
+            latents = [self._latent(frame) for frames in window for frame in frames]
+            first = len(window[0])
+            noises = self._noises(latents, prompt, window, self._reference_of(moment))[first:]
             edited = []
-            for index in now:
-                latent = self.model.latent_of(latents[index], noises[index])
-                picture = self.model.decode(latent, encoded[index].skips)
-                edited.append(self._picture(picture, frames[index]))
+            for frame, noise in zip(moment.now, noises, strict=False):
+                # Again, since the skips of a whole rig would take gigabytes.
+                one = self._encoded(frame)
+                latent = self.model.latent_of(one.latent, noise)
+                edited.append(self._picture(self.model.decode(latent, one.skips), frame))
         return tuple(edited)
 
     def _window(self, moment: Moment) -> tuple[Sequence[Frame], Sequence[Frame], Sequence[Frame]]:
@@ -177,6 +177,16 @@ class DiffusionEditor:
         batch = _stacked(latents, [frame for frames in window for frame in frames])
         with temporal_view(self.model.unet, links, self.attention):
             return self.model.noise(batch, prompt).split(1)
+
+    def _latent(self, frame: Frame) -> torch.Tensor:
+        """Kept for a while: it is asked for again in every style and at the next time."""
+        key = _digest_of(frame)
+        if key not in self._latents:
+            self._latents[key] = self._encoded(frame).latent
+        self._latents.move_to_end(key)
+        while len(self._latents) > LATENTS_KEPT:
+            self._latents.popitem(last=False)
+        return self._latents[key]
 
     def _encoded(self, frame: Frame) -> Encoded:
         height, width = self._size(frame)
@@ -263,6 +273,14 @@ def effective_weights(options: DiffusionOptions) -> AttentionWeights:
     if (view, before, after) != (given.view, given.before, given.after):
         itself = max(itself, 1 - view - before - after)
     return AttentionWeights(itself, view, before, after)
+
+
+def _digest_of(frame: Frame) -> bytes:
+    digest = hashlib.blake2b(repr(frame.image.shape).encode(), digest_size=16)
+    for array in (frame.image, frame.label):
+        if array is not None:
+            digest.update(array.tobytes())
+    return digest.digest()
 
 
 def _stacked(latents: Sequence[torch.Tensor], frames: Sequence[Frame]) -> torch.Tensor:

@@ -15,14 +15,16 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
+from weather_aug.clip.images import resized_label
 from weather_aug.clip.types import Frame
 from weather_aug.edit.background import STYLES, Moment
+from weather_aug.edit.devices import device_of
 from weather_aug.edit.diffusion.adapted import AdaptedModel
 from weather_aug.edit.diffusion.adapter_files import CARD, Card, load_adapter, read_card
 from weather_aug.edit.diffusion.attention import temporal_view
 from weather_aug.edit.diffusion.base import load_base
 from weather_aug.edit.diffusion.options import AttentionWeights, DiffusionOptions
-from weather_aug.edit.diffusion.references import view_references, window_links
+from weather_aug.edit.diffusion.references import Links, view_references, window_links
 from weather_aug.edit.diffusion.skips import Encoded
 from weather_aug.errors import ArgumentError, DataError, printable
 from weather_aug.taxonomy import IGNORE
@@ -53,7 +55,7 @@ class DiffusionEditor:
     def __init__(self, model: AdaptedModel, options: DiffusionOptions, card: Card) -> None:
         self.options, self._card = options, card
         dtype = torch.float16 if options.half else torch.float32
-        self.model = model.to(options.device, dtype)
+        self.model = model.to(device_of(options.device), dtype)
         self.attention = effective_weights(options)
         self._latents: OrderedDict[bytes, torch.Tensor] = OrderedDict()
 
@@ -66,7 +68,7 @@ class DiffusionEditor:
                 style in each subfolder of a style's name.
 
         Raises:
-            ArgumentError: If no adapter is given.
+            ArgumentError: If no adapter is given, or the device is not there.
             DataError: If base or adapter cannot be read or do not belong together.
             IntegrityError: If the adapter's weights are not those that it was saved with.
             MissingExtraError: If diffusers or peft are not installed.
@@ -76,6 +78,8 @@ class DiffusionEditor:
                 "the diffusion editor needs adapter=FOLDER (--adapter), as `weather-aug "
                 "train-editor` writes it"
             )
+        # Before minutes of reading.
+        device_of(options.device)
         folder = Path(options.adapter)
         singles = [style for style in STYLES if (folder / style / CARD).is_file()]
         if singles and not (folder / CARD).is_file():
@@ -130,9 +134,8 @@ class DiffusionEditor:
         window = self._window(moment)
         with torch.inference_mode(), self.model.styled(style) as prompt:
             latents = [self._latent(frame) for frames in window for frame in frames]
-            ahead = None if moment.look is None else moment.look(moment.now[0])[1].axes_world[0]
             first = len(window[0])
-            noises = self._noises(latents, prompt, window, ahead)[first:]
+            noises = self._noises(latents, prompt, window, self._reference_of(moment))[first:]
             edited = []
             for frame, noise in zip(moment.now, noises, strict=False):
                 # Again, since the skips of a whole rig would take gigabytes.
@@ -149,21 +152,27 @@ class DiffusionEditor:
         seen = [[f for f in frames if f.key.camera in names] for frames in (before, after)]
         return seen[0], moment.now, seen[1]
 
+    def _reference_of(self, moment: Moment) -> dict[str, str]:
+        """For each camera the one whose picture of the same time it sees; itself if none."""
+        cameras = [frame.key.camera for frame in moment.now]
+        if not self.attention.view:
+            return dict(zip(cameras, cameras, strict=True))
+        ahead = None if moment.look is None else moment.look(moment.now[0])[1].axes_world[0]
+        references = view_references([frame.camera for frame in moment.now], ahead)
+        return {camera: cameras[at] for camera, at in zip(cameras, references, strict=True)}
+
     def _noises(
         self,
         latents: Sequence[torch.Tensor],
         prompt: torch.Tensor,
         window: Sequence[Sequence[Frame]],
-        ahead_world: NDArray[np.float64] | None,
+        reference_of: Mapping[str, str],
     ) -> Sequence[torch.Tensor]:
         """Predictions for the (1, 4, h, w) latents of all frames of a window."""
-        now = window[1]
         if not (self.attention.view or self.attention.before or self.attention.after):
             # One at a time: pictures that do not see each other need no common memory.
-            return [self.model.noise(latent, prompt) for latent in latents]
-        cameras = [frame.key.camera for frame in now]
-        references = view_references([frame.camera for frame in now], ahead_world)
-        reference_of = {camera: cameras[at] for camera, at in zip(cameras, references, strict=True)}
+            with temporal_view(self.model.unet, Links((0,), (0,), (0,)), self.attention):
+                return [self.model.noise(latent, prompt) for latent in latents]
         links = window_links([[f.key.camera for f in frames] for frames in window], reference_of)
         batch = _stacked(latents, [frame for frames in window for frame in frames])
         with temporal_view(self.model.unet, links, self.attention):
@@ -187,10 +196,9 @@ class DiffusionEditor:
         pixels = self._padded(pixels.to(self.model.dtype) / 127.5 - 1)
         label = None
         if frame.label is not None and "labels" not in self.options.without:
-            ids = cv2.resize(
-                np.asarray(frame.label), (width, height), interpolation=cv2.INTER_NEAREST
-            )
-            label = torch.from_numpy(ids).to(self.model.device).long()[None]
+            # As in training: another rounding would shift it against the picture.
+            ids = resized_label(frame.label, width, height)
+            label = torch.tensor(ids, device=self.model.device).long()[None]
             bottom, right = pixels.shape[2] - height, pixels.shape[3] - width
             label = functional.pad(label, (0, right, 0, bottom), value=IGNORE)
         return self.model.encode(pixels, label)

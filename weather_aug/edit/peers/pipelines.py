@@ -12,9 +12,10 @@ from typing import Any
 import torch
 
 from weather_aug._extras import require
+from weather_aug.edit.devices import device_of
+from weather_aug.edit.diffusion.base import check_words
 from weather_aug.edit.peers.options import PeerOptions
 from weather_aug.edit.weights import MODEL_INDEX, digest_of, readable
-from weather_aug.errors import ArgumentError, printable
 
 PARTS = ("unet", "vae", "text_encoder", "tokenizer", "scheduler")
 LIBRARIES = ("diffusers", "transformers", "torch")
@@ -38,9 +39,11 @@ def load_pipeline(
         **components: Parts that are not read from the folder.
 
     Raises:
+        ArgumentError: If the device is not there.
         MissingExtraError: If diffusers is not installed.
         DataError: If the files are no such model.
     """
+    device = device_of(options.device)
     diffusers = require("diffusers", extra="edit", to=to)
     with readable(folder):
         pipeline = getattr(diffusers, kind).from_pretrained(
@@ -55,26 +58,13 @@ def load_pipeline(
             **components,
         )
         pipeline.set_progress_bar_config(disable=True)
-    return pipeline.to(device_of(options))
+    check_words(folder, pipeline.tokenizer, pipeline.text_encoder.config)
+    return pipeline.to(device)
 
 
 def precision_of(options: PeerOptions) -> torch.dtype:
     """Of the networks."""
     return torch.float16 if options.half else torch.float32
-
-
-def device_of(options: PeerOptions) -> torch.device:
-    """Of the networks.
-
-    Raises:
-        ArgumentError: If torch knows no such device.
-    """
-    try:
-        return torch.device(options.device)
-    except RuntimeError:
-        raise ArgumentError(
-            f"device: {printable(options.device)!r} is none of torch's, such as cpu or cuda"
-        ) from None
 
 
 @contextmanager

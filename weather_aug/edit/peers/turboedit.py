@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from weather_aug.clip.types import Frame
 from weather_aug.edit.background import Moment
+from weather_aug.edit.devices import device_of
 from weather_aug.edit.diffusion.base import Base, load_base
 from weather_aug.edit.diffusion.options import SD_TURBO
 from weather_aug.edit.peers.draws import generator_of
@@ -19,7 +20,7 @@ from weather_aug.edit.peers.instruct import unit_tensor
 from weather_aug.edit.peers.inversion import MOST_Z, draw, edited_latent, schedule
 from weather_aug.edit.peers.options import PeerOptions, check_style, styles_of
 from weather_aug.edit.peers.pictures import fitted, restored
-from weather_aug.edit.peers.pipelines import LIBRARIES, device_of, precision_of
+from weather_aug.edit.peers.pipelines import LIBRARIES, precision_of
 
 UInt8 = NDArray[np.uint8]
 
@@ -52,7 +53,7 @@ class TurboEdit:
 
     def __init__(self, base: Base, options: PeerOptions) -> None:
         self.base, self.options = base, options
-        self._device, self._dtype = device_of(options), precision_of(options)
+        self._device, self._dtype = device_of(options.device), precision_of(options)
         self._plan = schedule(int(options.steps or STEPS))
         texts = [str(options.source_prompt), *dict(options.prompts or {}).values()]
         embedded = base.embed(texts).to(self._device, self._dtype).split(1)

@@ -20,12 +20,12 @@ class Plan:
     streets: range = range(10, 34)
     times: int = 10
     """Of a street that is trained on, 0.9 s apart."""
-    held_out: range = range(100, 106)
+    held_out: range = range(100, 104)
     held_out_times: int = 8
     """0.1 s apart."""
     size_px: tuple[int, int] = (160, 96)
     schedule: Schedule = field(default_factory=Schedule)
-    steps: int = 1200
+    steps: int = 700
     batch: int = 2
     singles: bool = True
     """Whether single-style adapters are trained, too."""
@@ -65,13 +65,13 @@ def trained(plan: Plan, out: Path, name: str, steps: int, *words: str) -> Path:
     if not folder.is_dir():
         began = time.perf_counter()
         command = [sys.executable, "-m", "weather_aug.cli", "train-editor"]
-        given = [out / "pairs.jsonl", *flags(plan, out), "--out", folder, "--steps", steps]
+        given = [out / "pairs.jsonl", *flags(plan, out, steps), "--out", folder, "--steps", steps]
         subprocess.run([*command, *map(str, given), *words], check=True)
         print(f"{name}: {steps} steps took {time.perf_counter() - began:.0f} s", flush=True)
     return folder
 
 
-def flags(plan: Plan, out: Path) -> list[object]:
+def flags(plan: Plan, out: Path, steps: int) -> list[object]:
     """What all trainings have in common.
 
     Rates of SD-Turbo's size would move a small model nowhere in minutes; the picture's L1 counts
@@ -80,7 +80,7 @@ def flags(plan: Plan, out: Path) -> list[object]:
     width, height = plan.size_px
     return [
         *("--base", out / "base", "--size", height, width, "--batch-size", plan.batch),
-        *("--learning-rate", 3e-4, "--warm-up", 50, "--clip", 1.0),
+        *("--learning-rate", 1e-3, "--warm-up", 50, "--cool-down", steps // 2, "--clip", 1.0),
         *("--unet-rank", 16, "--vae-rank", 8, "--label-dropout", 0, "--threads", plan.threads),
         *("--weights", "l1=5", "epsilon=0.5", "perceptual=1"),
         *("--save-every", 10_000, "--sample-every", 0, "--validate-every", 0),

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from weather_aug.edit.diffusion.pair_lists import folder_pairs
-from weather_aug.edit.diffusion.pairs import Pair, PairList, write_pairs
 
 import weather_aug as wa
 from weather_aug._files import write_whole
 from weather_aug._png import png_bytes
 from weather_aug.clip.street import StreetClip
+from weather_aug.edit.diffusion.pair_lists import folder_pairs
+from weather_aug.edit.diffusion.pairs import PairList, with_clear, write_pairs
 from weather_aug.scene.styles import STYLE_SEVERITY, style_weather
 
 UInt8 = NDArray[np.uint8]
@@ -118,21 +118,7 @@ def write_pictures(root: Path, scenes: Sequence[wa.WeatherScene], split: str) ->
 
 
 def write_list(root: Path, path: Path) -> PairList:
-    """List the pairs below a folder, and to what is trained on pairs of a clear picture and itself.
-
-    From these an adapter learns what its clear style is, which blends fade to.
-    """
-    listed = folder_pairs(root)
-    itself: dict[str, Pair] = {}
-    for pair in listed.selected("train").pairs:
-        itself[pair.source] = replace(
-            pair,
-            style="clear",
-            target=pair.source,
-            target_label=pair.source_label,
-            target_sha256=pair.source_sha256,
-            target_pixels_sha256=pair.source_pixels_sha256,
-        )
-    listed = replace(listed, pairs=(*itself.values(), *listed.pairs))
+    """List the pairs below a folder, and each clear training picture with itself."""
+    listed = with_clear(folder_pairs(root))
     write_pairs(path, listed)
     return listed

@@ -248,7 +248,7 @@ def test_what_is_no_number_ends_the_training(learner: Learner, pairs: Path) -> N
 
 
 def test_the_learning_rate_rises_then_stays(learner: Learner, pairs: Path) -> None:
-    shares = [replace(OPTIONS, warm_up=4).learning_rate_share(step) for step in range(6)]
+    shares = [replace(OPTIONS, steps=9, warm_up=4).learning_rate_share(step) for step in range(6)]
     assert shares == [0.25, 0.5, 0.75, 1.0, 1.0, 1.0]
     falling = replace(OPTIONS, steps=6, warm_up=1, cool_down=3)
     shares = [falling.learning_rate_share(step) for step in range(6)]

@@ -36,6 +36,7 @@ needs_network = pytest.mark.skipif(bool(NO_NETWORK), reason=NO_NETWORK)
 OPTIONS = {
     "02_physics_figures": ["--quick"],
     "04_what_a_network_still_sees": ["--weights", str(NETWORK), "--frames", "1"],
+    "07_small_diffusion_editor": ["--quick"],
 }
 """Of recipes that take too long, write outside, or need a file, as they stand."""
 RECIPES = sorted((Path(__file__).parents[1] / "recipes").glob("[0-9]*.py"))

@@ -1,4 +1,4 @@
-"""Networks from files: whole, in silence, and on a device that there is."""
+"""Networks from files: whole, and in silence."""
 
 from __future__ import annotations
 
@@ -13,9 +13,7 @@ from safetensors.torch import load_file, save_file
 from tests.tiny_diffusion import build_tiny_sd
 from weather_aug.edit import loading
 from weather_aug.edit.diffusion.base import load_base
-from weather_aug.edit.diffusion.editor import DiffusionEditor
-from weather_aug.edit.diffusion.options import DiffusionOptions
-from weather_aug.errors import ArgumentError, DataError
+from weather_aug.errors import DataError
 
 
 @pytest.fixture(scope="module")
@@ -65,14 +63,3 @@ def test_the_libraries_would_speak(
     load_base(str(base)).embed(["snow"])
     sys.stderr.flush()
     assert "Loading weights" in capfd.readouterr().err
-
-
-@pytest.mark.parametrize("device", ["foo", "cuda:99", "opengl"])
-def test_a_device_that_is_not_here_is_one_sentence(device: str) -> None:
-    options = DiffusionOptions(adapter=Path("nowhere"), device=device)
-    with pytest.raises(ArgumentError, match="none that torch can use here"):
-        DiffusionEditor.load(options)
-
-
-def test_the_cpu_is_a_device() -> None:
-    assert loading.device_of("cpu").type == "cpu"

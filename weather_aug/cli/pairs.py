@@ -29,13 +29,16 @@ class ListPairs:
     """Leave out training pairs with a held-out picture, instead of refusing the list."""
     images: Literal["10k", "100k"] = "10k"
     """Which pictures of BDD100K: 10k have labels, 100k have none and are many."""
+    clear: bool = False
+    """List each clear training picture with itself, too, so that the adapter learns to leave a
+    picture as it is, and blends of weathers fade to that; for objective paired."""
     seed: int = 0
     """Which clear picture is drawn for one in a weather where none is of the same place."""
 
     def run(self) -> None:
         """Read the pictures, look for leaks, write the list and say what is in it."""
         from weather_aug.edit.diffusion import leakage, pair_lists
-        from weather_aug.edit.diffusion.pairs import SPLITS, write_pairs
+        from weather_aug.edit.diffusion.pairs import SPLITS, with_clear, write_pairs
 
         if self.images != "10k" and self.dataset != "bdd100k":
             raise ArgumentError("--images is for bdd100k")
@@ -59,6 +62,8 @@ class ListPairs:
             say(f"{dropped} training pairs left out, a picture of which is held out")
         else:
             leakage.check_no_leak(listed, self.held_out)
+        if self.clear:
+            listed = with_clear(listed)
         write_pairs(self.out, listed)
         counts = listed.counts()
         for style in listed.styles:

@@ -60,6 +60,8 @@ class TrainEditor:
     """5e-6 if not given."""
     warm_up: int | None = None
     """Steps over which the learning rate rises; 500 if not given."""
+    cool_down: int | None = None
+    """Steps at the end over which the learning rate falls to 0; 0 if not given."""
     clip: float | None = None
     """Largest norm of a gradient; 10 if not given."""
     mirrored: float | None = None

@@ -7,11 +7,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from weather_aug._extras import require
 from weather_aug.edit.weights import readable
-from weather_aug.errors import ArgumentError, DataError, printable
+from weather_aug.errors import DataError, printable
 
 _TO = "read the networks of an editor"
 
@@ -70,21 +68,3 @@ def quiet_libraries() -> Iterator[None]:
             diffusers.enable_progress_bar()
         for library, level in levels:
             library.set_verbosity(level)
-
-
-def device_of(name: str) -> torch.device:
-    """A device that torch can compute on here.
-
-    Raises:
-        ArgumentError: If torch knows none of that name, or cannot use it on this machine.
-    """
-    try:
-        device = torch.device(name)
-        torch.empty(0, device=device)
-    # AssertionError: a torch that was built without CUDA.
-    except (RuntimeError, AssertionError, NotImplementedError):
-        raise ArgumentError(
-            f"device: {printable(name)!r} is none that torch can use here; take cpu, or cuda on a "
-            "machine with a GPU"
-        ) from None
-    return device

@@ -242,3 +242,15 @@ def test_tensors_of_another_shape_are_refused(small_base: Path) -> None:
 def test_targets_that_are_nowhere_are_refused(small_base: Path) -> None:
     with pytest.raises(ArgumentError, match="no_such_layer"):
         adapted(small_base, AdapterSpec(unet_targets=("no_such_layer",), unet_rank=2))
+    with pytest.raises(ArgumentError, match="conv_in"):
+        AdapterSpec(unet_targets=("conv_in", "to_q"))
+
+
+def test_the_order_in_which_a_blend_is_given_changes_no_bit(model: AdaptedModel) -> None:
+    blend = {"snow": 0.3, "fog": 0.2, "rain": 0.5}
+    other = dict(reversed(blend.items()))
+    assert list(model.weights_of(blend)) == list(model.weights_of(other))
+
+
+def test_rounding_is_no_share_of_clear(model: AdaptedModel) -> None:
+    assert set(model.weights_of({"snow": 0.7, "rain": 0.3 - 1e-12})) == {"snow", "rain"}

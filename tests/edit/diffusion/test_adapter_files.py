@@ -147,3 +147,9 @@ def test_specs_survive_json() -> None:
         AdapterSpec(prompts={"snow": "s"}, conditioning="gray", skips=False, unet_rank=4),
     ):
         assert parse_spec(json.loads(json.dumps(spec.as_json()))) == spec
+
+
+def test_targets_that_the_base_lacks_are_the_adapters_fault(folder: Path, small_base: Path) -> None:
+    change_card(folder, lambda card: card["spec"].update(unet_targets=["no_such_layer"]))
+    with pytest.raises(DataError, match="no_such_layer"):
+        load_adapter(folder, load_base(str(small_base)))

@@ -80,3 +80,30 @@ def test_a_part_that_is_missing_is_named(copied: Path) -> None:
     shutil.rmtree(copied / "vae")
     with pytest.raises(DataError, match="vae"):
         load_base(str(copied))
+
+
+def test_a_tokenizer_without_its_words_is_refused(copied: Path) -> None:
+    """It loads, and all prompts would be one text."""
+    (copied / "tokenizer" / "tokenizer.json").unlink()
+    with pytest.raises(DataError, match="tokenizer knows"):
+        load_base(str(copied)).embed(["snow", "rain"])
+
+
+def test_prompts_are_as_long_as_the_text_encoder_reads(small_base: Path, copied: Path) -> None:
+    path = copied / "tokenizer" / "tokenizer_config.json"
+    config = json.loads(path.read_text())
+    del config["model_max_length"]
+    path.write_text(json.dumps(config))
+    expected = load_base(str(small_base)).embed(["snow"])
+    assert torch.equal(load_base(str(copied)).embed(["snow"]), expected)
+
+
+def test_a_text_encoder_of_another_width_is_refused(copied: Path) -> None:
+    from transformers import CLIPTextConfig, CLIPTextModel
+
+    folder = copied / "text_encoder"
+    config = CLIPTextConfig.from_pretrained(folder)
+    config.hidden_size *= 2
+    CLIPTextModel(config).save_pretrained(folder)
+    with pytest.raises(DataError, match="texts of width"):
+        load_base(str(copied)).embed(["snow"])

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from small_base import adapted, perturbed
 
+from weather_aug.clip.images import resized_label
 from weather_aug.clip.types import Camera, Frame, FrameKey
 from weather_aug.edit.background import BackgroundEditor, Moment
 from weather_aug.edit.diffusion.adapter_files import save_adapter
@@ -24,6 +27,7 @@ from weather_aug.edit.diffusion.options import (
     DiffusionOptions,
     paper_weights,
 )
+from weather_aug.edit.diffusion.skips import Encoded
 from weather_aug.edit.diffusion.spec import PROMPTS, AdapterSpec
 from weather_aug.errors import ArgumentError, DataError
 
@@ -211,3 +215,48 @@ def test_what_is_left_out_goes_to_the_picture_itself(
     got = effective_weights(DiffusionOptions(attention=attention, without=without))
     for name in ("itself", "view", "before", "after"):
         assert getattr(got, name) == pytest.approx(getattr(expected, name))
+
+
+def test_the_picture_alone_has_the_weight_that_is_asked_for(editor: DiffusionEditor) -> None:
+    moment = Moment((frame(1),))
+    whole = with_options(editor, attention=SELF_ONLY).edit(moment, "snow")
+    half = with_options(editor, attention=AttentionWeights(0.5, 0, 0, 0)).edit(moment, "snow")
+    assert all(differ(whole, half))
+
+
+def test_where_no_view_is_seen_nobody_asks_where_the_front_is(editor: DiffusionEditor) -> None:
+    def look(_: Frame) -> Any:
+        raise AssertionError("looked")
+
+    ring = tuple(frame(1, str(place), place * np.pi / 2) for place in range(4))
+    with pytest.raises(ArgumentError, match="evenly all around"):
+        editor.edit(Moment(ring), "snow")
+    blind = with_options(editor, without=("view",))
+    assert len(blind.edit(Moment(ring, look=look), "snow")) == 4
+
+
+def test_labels_are_resized_as_in_training(
+    editor: DiffusionEditor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+    smaller = with_options(editor, height=16)
+    encode = smaller.model.encode
+
+    def encoded(pixels: torch.Tensor, label: torch.Tensor) -> Encoded:
+        seen.append(label)
+        return encode(pixels, label)
+
+    monkeypatch.setattr(smaller.model, "encode", encoded)
+    one = frame(1)
+    smaller.edit(Moment((one,)), "snow")
+    width = round(WIDTH * 16 / HEIGHT)
+    assert np.array_equal(seen[0][0, :16, :width], resized_label(one.label, width, 16))
+
+
+def test_a_device_that_is_not_there_is_one_sentence(
+    editor: DiffusionEditor, folders: tuple[Path, Path]
+) -> None:
+    for device in ("gpu", "cuda:99"):
+        options = DiffusionOptions(str(folders[0]), folders[1], device=device)
+        with pytest.raises(ArgumentError, match=device):
+            DiffusionEditor.load(options)

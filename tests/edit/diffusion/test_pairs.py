@@ -24,6 +24,7 @@ from weather_aug.edit.diffusion.pairs import (
     joined,
     read_pairs,
     told_counts,
+    with_clear,
     write_pairs,
 )
 from weather_aug.errors import ArgumentError, DataError, OutputError
@@ -262,3 +263,27 @@ def test_lists_of_several_sets_are_joined(tmp_path: Path) -> None:
     assert joined([one]) == one
     with pytest.raises(ArgumentError, match="no pair list"):
         joined([])
+
+
+def test_clear_pictures_are_listed_with_themselves(tmp_path: Path) -> None:
+    """Once each, of those that are trained on only, and not again a second time."""
+    names = ("rain", "train", "a"), ("snow", "train", "a"), ("fog", "val", "b")
+    pairs = [
+        pair_of(
+            tmp_path,
+            f"clear/{name}.png",
+            f"{style}/{name}.png",
+            style=style,
+            split=split,
+            aligned=False,
+        )
+        for style, split, name in names
+    ]
+    listed = list_of(tmp_path, *pairs)
+    whole = with_clear(listed)
+    clear = whole.selected("train", "clear").pairs
+    assert [pair.source for pair in clear] == ["clear/a.png"]
+    assert clear[0].target == clear[0].source and clear[0].aligned
+    assert clear[0].target_sha256 == clear[0].source_sha256
+    assert whole.pairs[1:] == listed.pairs
+    assert with_clear(whole) == whole

@@ -167,3 +167,8 @@ def test_edges_are_where_the_picture_steps():
     edges = canny(image)
     assert edges[:, 11:13].any() and not edges[:, :10].any() and not edges[:, 14:].any()
     assert np.array_equal(edges[..., 0], cv2.Canny(image[..., 0].copy(), 100, 200))
+
+
+def test_a_strength_that_leaves_no_step_is_refused(load):
+    with pytest.raises(ArgumentError, match="runs none"):
+        load(steps=1, strength=0.8)

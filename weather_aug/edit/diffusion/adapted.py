@@ -189,9 +189,10 @@ class AdaptedModel(nn.Module):
         total = math.fsum(weights.values())
         if total > 1 + 1e-6:
             raise ArgumentError(f"weights of styles sum to {total:g}; at most 1 can be given")
-        if CLEAR in self.spec.styles and total < 1:
+        if CLEAR in self.spec.styles and total < 1 - 1e-6:
             weights[CLEAR] = weights.get(CLEAR, 0.0) + 1 - total
-        weights = {name: weight for name, weight in weights.items() if weight > 0}
+        # In one order: sums of sets and prompts depend on it in their last bits.
+        weights = {name: weights[name] for name in self.spec.styles if weights.get(name, 0) > 0}
         if not weights:
             raise ArgumentError("a blend needs a style with a weight above 0")
         return weights

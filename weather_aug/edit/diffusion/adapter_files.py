@@ -22,7 +22,7 @@ from weather_aug._extras import require
 from weather_aug.edit.diffusion.adapted import AdaptedModel
 from weather_aug.edit.diffusion.base import TO, Base
 from weather_aug.edit.diffusion.spec import AdapterSpec, parse_spec
-from weather_aug.errors import DataError, IntegrityError, SceneError, printable
+from weather_aug.errors import ArgumentError, DataError, IntegrityError, printable
 
 FORMAT = "weather_aug adapter"
 VERSION = 1
@@ -118,9 +118,9 @@ def read_card(folder: Path) -> Card:
             licence=str(content["licence"]),
             training=dict(content["training"]),
         )
+    except DataError:
+        raise
     except (KeyError, TypeError, ValueError) as error:
-        if isinstance(error, DataError) and not isinstance(error, SceneError):
-            raise
         raise DataError(
             f"{printable(path, 200)} is malformed: {type(error).__name__} {printable(error)}"
         ) from None
@@ -146,7 +146,12 @@ def load_adapter(folder: Path, base: Base, *, other_base: bool = False) -> Adapt
             f"{printable(card.base_digest[:12])}, the base {base.name} has {base.digest[:12]}; "
             "give that base, or other_base=True to use it all the same"
         )
-    model = AdaptedModel(base, card.spec)
+    try:
+        model = AdaptedModel(base, card.spec)
+    except ArgumentError as error:
+        raise DataError(
+            f"{printable(folder, 200)} does not fit the base {printable(base.name)}: {error}"
+        ) from None
     model.load_trained(_weights(folder, card))
     return model.frozen()
 

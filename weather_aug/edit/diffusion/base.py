@@ -57,7 +57,8 @@ class Base:
         """(N, tokens, width) of the text encoder, which is read for this and let go.
 
         Raises:
-            DataError: If the text encoder's files cannot be read.
+            DataError: If the files of tokenizer and text encoder cannot be read, or the two and
+                the UNet are not of one model.
         """
         transformers = require("transformers", extra="edit", to=TO)
         with readable(self.folder), quiet_libraries():
@@ -65,10 +66,12 @@ class Base:
                 self.folder / "tokenizer", local_files_only=True
             )
         encoder = read_network(transformers.CLIPTextModel, self.folder / "text_encoder")
+        check_words(self.folder, tokenizer, encoder.config)
+        self._check_width(encoder.config)
         tokens = tokenizer(
             list(prompts),
             padding="max_length",
-            max_length=tokenizer.model_max_length,
+            max_length=encoder.config.max_position_embeddings,
             truncation=True,
             return_tensors="pt",
         )
@@ -76,6 +79,15 @@ class Base:
             hidden = encoder.eval()(tokens.input_ids)[0]
         # Inference tensors cannot take part in training.
         return hidden.clone()
+
+    def _check_width(self, config: Any) -> None:
+        width = self.unet.config.cross_attention_dim
+        if config.hidden_size != width:
+            raise DataError(
+                f"{printable(self.folder, 200)}: the UNet reads texts of width {printable(width)}, "
+                f"the text encoder gives {config.hidden_size}; only models with one text encoder, "
+                "such as SD-Turbo, can be used"
+            )
 
 
 def load_base(base: str) -> Base:
@@ -99,7 +111,7 @@ def load_base(base: str) -> Base:
         )
     _check(folder, unet, vae, schedule)
     return Base(
-        name=base if is_model_id(base) and not Path(base).is_dir() else folder.name,
+        name=base if is_model_id(base) and not Path(base).is_dir() else folder.resolve().name,
         revision=folder.name if folder.parent.name == "snapshots" else "",
         digest=digest_of(folder, PARTS),
         folder=folder,
@@ -107,6 +119,27 @@ def load_base(base: str) -> Base:
         vae=vae.eval().requires_grad_(False),
         alpha_bars=schedule.alphas_cumprod.double(),
     )
+
+
+def check_words(folder: Path, tokenizer: Any, config: Any) -> None:
+    """Refuse a tokenizer that is not the text encoder's.
+
+    One whose vocabulary is missing loads without a word, and makes the same text of all.
+
+    Args:
+        folder: Of the model, to be named.
+        tokenizer: Of transformers.
+        config: Of the text encoder.
+
+    Raises:
+        DataError: If they do not know as many tokens.
+    """
+    if len(tokenizer) != config.vocab_size:
+        raise DataError(
+            f"{printable(folder, 200)}: the tokenizer knows {len(tokenizer)} tokens, the text "
+            f"encoder {config.vocab_size}; a file of the tokenizer is missing, or they are not of "
+            "one model"
+        )
 
 
 def _check(folder: Path, unet: Any, vae: Any, schedule: Any) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -13,20 +15,24 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
+from weather_aug.clip.images import resized_label
 from weather_aug.clip.types import Frame
 from weather_aug.edit.background import STYLES, Moment
+from weather_aug.edit.devices import device_of
 from weather_aug.edit.diffusion.adapted import AdaptedModel
 from weather_aug.edit.diffusion.adapter_files import CARD, Card, load_adapter, read_card
 from weather_aug.edit.diffusion.attention import temporal_view
 from weather_aug.edit.diffusion.base import load_base
 from weather_aug.edit.diffusion.options import AttentionWeights, DiffusionOptions
-from weather_aug.edit.diffusion.references import view_references, window_links
+from weather_aug.edit.diffusion.references import Links, view_references, window_links
 from weather_aug.edit.diffusion.skips import Encoded
-from weather_aug.edit.loading import device_of
 from weather_aug.errors import ArgumentError, DataError, printable
 from weather_aug.taxonomy import IGNORE
 
 UInt8 = NDArray[np.uint8]
+
+LATENTS_KEPT = 32
+"""By their pixels: more than three times of six cameras, a few MB."""
 
 
 class DiffusionEditor:
@@ -49,8 +55,9 @@ class DiffusionEditor:
     def __init__(self, model: AdaptedModel, options: DiffusionOptions, card: Card) -> None:
         self.options, self._card = options, card
         dtype = torch.float16 if options.half else torch.float32
-        self.model = model.to(options.device, dtype)
+        self.model = model.to(device_of(options.device), dtype)
         self.attention = effective_weights(options)
+        self._latents: OrderedDict[bytes, torch.Tensor] = OrderedDict()
 
     @classmethod
     def load(cls, options: DiffusionOptions) -> DiffusionEditor | SingleStyleEditors:
@@ -61,7 +68,7 @@ class DiffusionEditor:
                 style in each subfolder of a style's name.
 
         Raises:
-            ArgumentError: If no adapter is given, or torch has no such device.
+            ArgumentError: If no adapter is given, or the device is not there.
             DataError: If base or adapter cannot be read or do not belong together.
             IntegrityError: If the adapter's weights are not those that it was saved with.
             MissingExtraError: If diffusers or peft are not installed.
@@ -71,6 +78,8 @@ class DiffusionEditor:
                 "the diffusion editor needs adapter=FOLDER (--adapter), as `weather-aug "
                 "train-editor` writes it"
             )
+        # Before minutes of reading.
+        device_of(options.device)
         folder = Path(options.adapter)
         singles = [style for style in STYLES if (folder / style / CARD).is_file()]
         if singles and not (folder / CARD).is_file():
@@ -80,7 +89,6 @@ class DiffusionEditor:
 
     @classmethod
     def _of(cls, folder: Path, options: DiffusionOptions) -> DiffusionEditor:
-        device_of(options.device)
         card = read_card(folder)
         model = load_adapter(folder, load_base(options.base), other_base=options.other_base)
         return cls(model, options, card)
@@ -124,16 +132,15 @@ class DiffusionEditor:
             DataError: If the cameras' pictures have different sizes and are to look at each other.
         """
         window = self._window(moment)
-        frames = [frame for frames in window for frame in frames]
-        first_now = len(window[0])
         with torch.inference_mode(), self.model.styled(style) as prompt:
-            encoded = [self._encoded(frame) for frame in frames]
-            ahead = None if moment.look is None else moment.look(moment.now[0])[1].axes_world[0]
-            noises = self._noises([one.latent for one in encoded], prompt, window, ahead)
+            latents = [self._latent(frame) for frames in window for frame in frames]
+            first = len(window[0])
+            noises = self._noises(latents, prompt, window, self._reference_of(moment))[first:]
             edited = []
-            for index, frame in enumerate(moment.now, start=first_now):
-                one = encoded[index]
-                latent = self.model.latent_of(one.latent, noises[index])
+            for frame, noise in zip(moment.now, noises, strict=False):
+                # Again, since the skips of a whole rig would take gigabytes.
+                one = self._encoded(frame)
+                latent = self.model.latent_of(one.latent, noise)
                 edited.append(self._picture(self.model.decode(latent, one.skips), frame))
         return tuple(edited)
 
@@ -145,25 +152,41 @@ class DiffusionEditor:
         seen = [[f for f in frames if f.key.camera in names] for frames in (before, after)]
         return seen[0], moment.now, seen[1]
 
+    def _reference_of(self, moment: Moment) -> dict[str, str]:
+        """For each camera the one whose picture of the same time it sees; itself if none."""
+        cameras = [frame.key.camera for frame in moment.now]
+        if not self.attention.view:
+            return dict(zip(cameras, cameras, strict=True))
+        ahead = None if moment.look is None else moment.look(moment.now[0])[1].axes_world[0]
+        references = view_references([frame.camera for frame in moment.now], ahead)
+        return {camera: cameras[at] for camera, at in zip(cameras, references, strict=True)}
+
     def _noises(
         self,
         latents: Sequence[torch.Tensor],
         prompt: torch.Tensor,
         window: Sequence[Sequence[Frame]],
-        ahead_world: NDArray[np.float64] | None,
+        reference_of: Mapping[str, str],
     ) -> Sequence[torch.Tensor]:
         """Predictions for the (1, 4, h, w) latents of all frames of a window."""
-        now = window[1]
         if not (self.attention.view or self.attention.before or self.attention.after):
             # One at a time: pictures that do not see each other need no common memory.
-            return [self.model.noise(latent, prompt) for latent in latents]
-        cameras = [frame.key.camera for frame in now]
-        references = view_references([frame.camera for frame in now], ahead_world)
-        reference_of = {camera: cameras[at] for camera, at in zip(cameras, references, strict=True)}
+            with temporal_view(self.model.unet, Links((0,), (0,), (0,)), self.attention):
+                return [self.model.noise(latent, prompt) for latent in latents]
         links = window_links([[f.key.camera for f in frames] for frames in window], reference_of)
         batch = _stacked(latents, [frame for frames in window for frame in frames])
         with temporal_view(self.model.unet, links, self.attention):
             return self.model.noise(batch, prompt).split(1)
+
+    def _latent(self, frame: Frame) -> torch.Tensor:
+        """Kept for a while: it is asked for again in every style and at the next time."""
+        key = _digest_of(frame)
+        if key not in self._latents:
+            self._latents[key] = self._encoded(frame).latent
+        self._latents.move_to_end(key)
+        while len(self._latents) > LATENTS_KEPT:
+            self._latents.popitem(last=False)
+        return self._latents[key]
 
     def _encoded(self, frame: Frame) -> Encoded:
         height, width = self._size(frame)
@@ -173,10 +196,9 @@ class DiffusionEditor:
         pixels = self._padded(pixels.to(self.model.dtype) / 127.5 - 1)
         label = None
         if frame.label is not None and "labels" not in self.options.without:
-            ids = cv2.resize(
-                np.asarray(frame.label), (width, height), interpolation=cv2.INTER_NEAREST
-            )
-            label = torch.from_numpy(ids).to(self.model.device).long()[None]
+            # As in training: another rounding would shift it against the picture.
+            ids = resized_label(frame.label, width, height)
+            label = torch.tensor(ids, device=self.model.device).long()[None]
             bottom, right = pixels.shape[2] - height, pixels.shape[3] - width
             label = functional.pad(label, (0, right, 0, bottom), value=IGNORE)
         return self.model.encode(pixels, label)
@@ -251,6 +273,14 @@ def effective_weights(options: DiffusionOptions) -> AttentionWeights:
     if (view, before, after) != (given.view, given.before, given.after):
         itself = max(itself, 1 - view - before - after)
     return AttentionWeights(itself, view, before, after)
+
+
+def _digest_of(frame: Frame) -> bytes:
+    digest = hashlib.blake2b(repr(frame.image.shape).encode(), digest_size=16)
+    for array in (frame.image, frame.label):
+        if array is not None:
+            digest.update(array.tobytes())
+    return digest.digest()
 
 
 def _stacked(latents: Sequence[torch.Tensor], frames: Sequence[Frame]) -> torch.Tensor:

@@ -42,8 +42,8 @@ class AttentionWeights:
 def paper_weights(blend: float = 0.6) -> AttentionWeights:
     """Weights of WeatherEdit's equation: blend * Self + (1 - blend) * (View + Temporal).
 
-    They sum to 2 - blend, not to 1: with 0.6 every layer's output is a good third too large. The
-    temporal term is the mean of both neighbours.
+    They sum to 2 - blend, not to 1: with 0.6 every layer's output is 40 % too large. The temporal
+    term is the mean of both neighbours.
     """
     rest = 1 - finite("blend", blend, 0, 1)
     return AttentionWeights(blend, rest, rest / 2, rest / 2)

@@ -199,6 +199,26 @@ def write_pairs(path: Path, pair_list: PairList) -> None:
             file.write(json.dumps(record).encode() + b"\n")
 
 
+def with_clear(listed: PairList) -> PairList:
+    """The list, and of each clear picture that is trained on a pair with itself.
+
+    From these an adapter learns the style "clear", which blends of styles fade to.
+    """
+    itself: dict[str, Pair] = {}
+    for pair in listed.selected("train").pairs:
+        itself[pair.source] = replace(
+            pair,
+            style="clear",
+            target=pair.source,
+            target_label=pair.source_label,
+            target_sha256=pair.source_sha256,
+            target_pixels_sha256=pair.source_pixels_sha256,
+            aligned=True,
+        )
+    others = (pair for pair in listed.pairs if pair.style != "clear")
+    return replace(listed, pairs=(*itself.values(), *others))
+
+
 def read_pairs(path: Path, *, root: Path | None = None) -> PairList:
     """Read a list from an untrusted place; pictures are not looked at.
 

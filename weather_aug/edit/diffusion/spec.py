@@ -92,6 +92,10 @@ class AdapterSpec:
             targets = getattr(self, name)
             if not targets or not all(isinstance(t, str) and 0 < len(t) <= 64 for t in targets):
                 raise ArgumentError(f"{name} must name layers, got {printable(targets)}")
+        if "conv_in" in self.unet_targets:
+            raise ArgumentError(
+                "unet_targets names conv_in, which is trained in full; leave it out"
+            )
 
     @property
     def styles(self) -> tuple[str, ...]:

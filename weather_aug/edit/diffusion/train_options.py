@@ -69,6 +69,9 @@ class TrainOptions:
     """Of the discriminators' AdamW; the release's is the adapter's."""
     warm_up: int = 500
     """Steps over which the learning rate rises to its own value, where it stays; the release's."""
+    cool_down: int = 0
+    """Steps at the end over which the learning rate falls to 0; the release has none. Without, a
+    short training with a high rate ends where its last batches pushed it."""
     clip: float = 10.0
     """Largest norm of a gradient; larger ones are scaled down to it. The release's."""
     size: tuple[int, int] = (512, 512)
@@ -138,6 +141,7 @@ class TrainOptions:
             "batch_size": 1,
             "accumulate": 1,
             "warm_up": 0,
+            "cool_down": 0,
             "save_every": 1,
             "sample_every": 0,
             "validate_every": 0,
@@ -195,8 +199,9 @@ class TrainOptions:
         )
 
     def learning_rate_share(self, step: int) -> float:
-        """Of the learning rates at a step, from 0 on: a linear rise, then 1."""
-        return min(1.0, (step + 1) / max(1, self.warm_up))
+        """Of the learning rates at a step, from 0 on: a linear rise, then 1, then a linear fall."""
+        rise = (step + 1) / max(1, self.warm_up)
+        return min(1.0, rise, (self.steps - step) / (self.cool_down + 1))
 
     def as_json(self) -> dict[str, Any]:
         """JSON values; the weights are those of the objective alone."""

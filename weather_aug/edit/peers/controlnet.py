@@ -68,8 +68,8 @@ class ControlNet:
         """Read both models from disk.
 
         Raises:
-            ArgumentError: If an option is not of this peer, or no ControlNet is published for the
-                condition and none is given.
+            ArgumentError: If an option is not of this peer, no ControlNet is published for the
+                condition and none is given, or no step is left to run.
             DataError: If a model is not there, which says how to fetch it, or they do not belong
                 together.
             MissingExtraError: If diffusers is not installed.
@@ -91,6 +91,11 @@ class ControlNet:
             guidance=GUIDANCE,
             prompts=PROMPTS,
         )
+        steps, strength = options.steps or STEPS, options.strength or STRENGTH
+        if int(steps * strength) < 1:
+            raise ArgumentError(
+                f"of {steps} steps a strength of {strength:g} runs none; give more of either"
+            )
         folder = located(str(options.base), to=_TO, what="the text model", needs=needs_of())
         control = located(
             str(options.control), to=_TO, what="the ControlNet", needs=("config.json",)

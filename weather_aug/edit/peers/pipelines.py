@@ -12,7 +12,9 @@ from typing import Any
 import torch
 
 from weather_aug._extras import require
-from weather_aug.edit.loading import device_of, quiet_libraries
+from weather_aug.edit.devices import device_of
+from weather_aug.edit.diffusion.base import check_words
+from weather_aug.edit.loading import quiet_libraries
 from weather_aug.edit.peers.options import PeerOptions
 from weather_aug.edit.weights import MODEL_INDEX, digest_of, readable
 
@@ -38,12 +40,12 @@ def load_pipeline(
         **components: Parts that are not read from the folder.
 
     Raises:
-        ArgumentError: If torch has no such device.
+        ArgumentError: If the device is not there.
         MissingExtraError: If diffusers is not installed.
         DataError: If the files are no such model.
     """
-    diffusers = require("diffusers", extra="edit", to=to)
     device = device_of(options.device)
+    diffusers = require("diffusers", extra="edit", to=to)
     with readable(folder), quiet_libraries():
         pipeline = getattr(diffusers, kind).from_pretrained(
             folder,
@@ -57,6 +59,7 @@ def load_pipeline(
             **components,
         )
         pipeline.set_progress_bar_config(disable=True)
+    check_words(folder, pipeline.tokenizer, pipeline.text_encoder.config)
     return pipeline.to(device)
 
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from weather_aug.clip.types import Frame
 from weather_aug.edit.background import Moment
+from weather_aug.edit.devices import device_of
 from weather_aug.edit.diffusion.base import Base, load_base
 from weather_aug.edit.diffusion.options import SD_TURBO
-from weather_aug.edit.loading import device_of
 from weather_aug.edit.peers.draws import generator_of
 from weather_aug.edit.peers.instruct import unit_tensor
 from weather_aug.edit.peers.inversion import MOST_Z, draw, edited_latent, schedule

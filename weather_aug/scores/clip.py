@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from weather_aug._checks import image_uint8
 from weather_aug._extras import require
+from weather_aug.edit.loading import quiet_libraries
 from weather_aug.errors import ArgumentError, DataError, printable
 
 Float64 = NDArray[np.float64]
@@ -162,7 +163,7 @@ def load_encoder(source: str | Path = CLIP_LARGE, *, device: str = "cpu") -> Enc
         DataError: If the weights are not there, or are no CLIP model.
     """
     transformers = require("transformers", extra="edit", to="score pictures with CLIP")
-    with _readable(source):
+    with _readable(source), quiet_libraries():
         model, loaded = transformers.CLIPModel.from_pretrained(
             source, local_files_only=True, use_safetensors=True, output_loading_info=True
         )

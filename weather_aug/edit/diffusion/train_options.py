@@ -181,7 +181,7 @@ class TrainOptions:
                 if "perceptual" in name and weight > 0:
                     raise ArgumentError(
                         f'perceptual "none" does not go with a weight of {name} of {weight:g}; set '
-                        "it to 0"
+                        f"it to 0 (--weights {name}=0)"
                     )
         if self.device == "cpu" and self.mixed_precision == "fp16":
             raise ArgumentError('mixed_precision "fp16" needs a GPU; on a CPU take "no" or "bf16"')

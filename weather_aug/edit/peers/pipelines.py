@@ -14,7 +14,7 @@ import torch
 from weather_aug._extras import require
 from weather_aug.edit.devices import device_of
 from weather_aug.edit.diffusion.base import check_words
-from weather_aug.edit.loading import quiet_libraries
+from weather_aug.edit.loading import quiet_libraries, read_network
 from weather_aug.edit.peers.options import PeerOptions
 from weather_aug.edit.weights import MODEL_INDEX, digest_of, readable
 
@@ -46,12 +46,20 @@ def load_pipeline(
     """
     device = device_of(options.device)
     diffusers = require("diffusers", extra="edit", to=to)
+    transformers = require("transformers", extra="edit", to=to)
+    kinds = {
+        "unet": diffusers.UNet2DConditionModel,
+        "vae": diffusers.AutoencoderKL,
+        "text_encoder": transformers.CLIPTextModel,
+    }
+    for part in _NETWORKS:
+        if part not in components:
+            components[part] = read_network(kinds[part], folder / part)
     with readable(folder), quiet_libraries():
         pipeline = getattr(diffusers, kind).from_pretrained(
             folder,
             local_files_only=True,
             use_safetensors=True,
-            dtype=precision_of(options),
             safety_checker=None,
             feature_extractor=None,
             image_encoder=None,
@@ -60,7 +68,7 @@ def load_pipeline(
         )
         pipeline.set_progress_bar_config(disable=True)
     check_words(folder, pipeline.tokenizer, pipeline.text_encoder.config)
-    return pipeline.to(device)
+    return pipeline.to(device, precision_of(options))
 
 
 def precision_of(options: PeerOptions) -> torch.dtype:

@@ -102,15 +102,14 @@ def build(
         raise ClipError(
             f"clip {clip.name} is of unrelated pictures; only a drive can be reconstructed"
         )
-    # Before networks are read, which takes a while.
-    publish.check_free(publish.located(out), overwrite)
-    editing = editing_of(editor, editor_options, weathers, clip)
-    if weathers is None:
-        weathers = STYLES if editing is None else editing.styles
     out = publish.located(out)
     with publish.held(out):
         publish.settle_replacement(out)
+        # Before networks are read, which takes a while.
         publish.check_free(out, overwrite)
+        editing = editing_of(editor, editor_options, weathers, clip)
+        if weathers is None:
+            weathers = STYLES if editing is None else editing.styles
         work = publish.work_folder(out)
         try:
             content = _content(clip, work, editing, weathers, progress, wanted)

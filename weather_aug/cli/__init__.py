@@ -20,6 +20,7 @@ from weather_aug.cli.pairs import ListPairs
 from weather_aug.cli.render import Render
 from weather_aug.cli.terminal import check_folder, complain, say, to_people
 from weather_aug.cli.train import TrainEditor
+from weather_aug.cli.values import numbers_by_name
 from weather_aug.cli.view import View
 from weather_aug.errors import (
     ArgumentError,
@@ -236,21 +237,7 @@ def parsed_types(items: tuple[str, ...]) -> dict[str, float]:
     Raises:
         ArgumentError: If a text is no type and number, or a type stands twice.
     """
-    weights: dict[str, float] = {}
-    for item in items:
-        name, _, text = item.partition("=")
-        try:
-            weight = float(text)
-        except ValueError:
-            weight = None
-        if not name or weight is None:
-            raise ArgumentError(
-                f"--types takes type=weight, such as rain=2 rain+fog=1, got {printable(item)!r}"
-            )
-        if name in weights:
-            raise ArgumentError(f"--types: {printable(name)!r} stands twice")
-        weights[name] = weight
-    return weights
+    return numbers_by_name("--types", "type=weight, such as rain=2 rain+fog=1", items)
 
 
 def _inspected(path: Path) -> tuple[list[str], str]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from weather_aug.cli.terminal import say, to_people
-from weather_aug.errors import ArgumentError, printable
+from weather_aug.cli.values import numbers_by_name
 
 if TYPE_CHECKING:
     from weather_aug.edit.diffusion.train_options import TrainOptions
@@ -151,21 +151,7 @@ def parsed_weights(items: tuple[str, ...]) -> dict[str, float]:
     Raises:
         ArgumentError: If a text is no name and number, or a name stands twice.
     """
-    weights: dict[str, float] = {}
-    for item in items:
-        name, _, text = item.partition("=")
-        try:
-            value = float(text)
-        except ValueError:
-            value = None
-        if not name or value is None:
-            raise ArgumentError(
-                f"--weights takes name=value, such as l1=1, got {printable(item)!r}"
-            )
-        if name in weights:
-            raise ArgumentError(f"--weights: {printable(name)!r} stands twice")
-        weights[name] = value
-    return weights
+    return numbers_by_name("--weights", "name=value, such as l1=1", items)
 
 
 def _told(losses: Any) -> str:

@@ -86,7 +86,7 @@ class PairImages(Dataset[dict[str, Any]]):
     ) -> None:
         self.pair_list = pair_list.selected(split, style)
         self.style = style
-        self.size = _checked_size(size)
+        self.size = checked_size(size)
         if short_side is not None and not 1 <= short_side <= 2**14:
             raise ArgumentError(f"short_side must be in 1..{2**14} pixels, got {short_side!r}")
         self.short_side = short_side
@@ -278,7 +278,12 @@ def _px(array: NDArray[Any]) -> str:
     return f"{array.shape[1]}x{array.shape[0]} pixels"
 
 
-def _checked_size(size: Sequence[int]) -> tuple[int, int]:
+def checked_size(size: Sequence[int]) -> tuple[int, int]:
+    """(height, width) of crops, or a refusal of what is none.
+
+    Raises:
+        ArgumentError: If it is not two multiples of 8 pixels.
+    """
     sides = tuple(size)
     good = len(sides) == 2 and all(
         isinstance(side, int) and 0 < side <= 2**14 and side % SIDE_MULTIPLE_PX == 0

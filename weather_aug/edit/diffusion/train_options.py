@@ -10,6 +10,7 @@ from weather_aug._checks import finite
 from weather_aug._keys import check_seed
 from weather_aug.edit.diffusion.discriminator import CLIP, DiscriminatorKind
 from weather_aug.edit.diffusion.objectives import CycleWeights, EpsilonWeights, PairedWeights
+from weather_aug.edit.diffusion.pair_data import checked_size
 from weather_aug.edit.diffusion.pairs import PAIR_STYLES
 from weather_aug.edit.diffusion.perceptual import Perceptual
 from weather_aug.edit.diffusion.spec import PROMPTS, AdapterSpec, Conditioning
@@ -23,7 +24,6 @@ BETAS = (0.9, 0.999)
 """Of AdamW, as in the release."""
 WEIGHT_DECAY = 1e-2
 """Of AdamW, as in the release."""
-SIDE_MULTIPLE_PX = 8
 MOST_STEPS = 10_000_000
 
 
@@ -131,7 +131,7 @@ class TrainOptions:
         finite("mirrored", self.mirrored, 0, 1)
         finite("label_dropout", self.label_dropout, 0, 1)
         check_seed("seed", self.seed)
-        object.__setattr__(self, "size", _size(self.size))
+        object.__setattr__(self, "size", checked_size(self.size))
         # Ranks and conditioning have one place where they are checked.
         self.spec(self.styles or PAIR_STYLES)
 
@@ -243,17 +243,3 @@ def _count(name: str, value: Any, least: int) -> None:
         raise ArgumentError(
             f"{name} must be an integer in {least}..{MOST_STEPS}, got {printable(value)}"
         )
-
-
-def _size(size: Any) -> tuple[int, int]:
-    sides = tuple(size)
-    good = len(sides) == 2 and all(
-        isinstance(side, int) and 0 < side <= 2**14 and side % SIDE_MULTIPLE_PX == 0
-        for side in sides
-    )
-    if not good:
-        raise ArgumentError(
-            f"size must be (height, width), multiples of {SIDE_MULTIPLE_PX} pixels, got "
-            f"{printable(size)}"
-        )
-    return sides[0], sides[1]

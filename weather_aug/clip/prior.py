@@ -80,7 +80,7 @@ def geometric_prior_depth(
     """
     classes = _filled_label(label)
     height = classes.shape[0]
-    finite("focal_px", focal_px, 1.0)
+    finite("focal_px", focal_px, 1e-3)
     finite("camera_height_m", camera_height_m, 0.1, 100.0)
     finite("pitch_rad", pitch_rad, -0.7, 0.7)
     principal_y = finite("principal_px[1]", principal_px[1], -1e6, 1e6)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import reduce
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 from weather_aug._checks import finite
 from weather_aug._keys import key_of, uniforms
 from weather_aug.errors import ArgumentError, printable
-from weather_aug.severity import parse_severity
+from weather_aug.severity import fog_severity, parse_severity, rain_severity, snow_severity
 from weather_aug.weather import Weather
 
 TYPES = ("clear", "rain", "snow", "fog")
@@ -100,11 +100,65 @@ class WeatherPolicy:
         object.__setattr__(self, "types", types)
         object.__setattr__(self, "severity", (low, high))
 
-    def draw(self, seed: int, epoch: int, item: int) -> WeatherDraw:
-        """The weather of one item of one epoch."""
+    @classmethod
+    def rain(
+        cls,
+        mm_per_h: tuple[float, float] = (1.5, 75.0),
+        *,
+        falling: float = 1.0,
+        variation: float = 1.0,
+    ) -> WeatherPolicy:
+        """Rain alone, of rates in a range in mm/h."""
+        severity = _severities("mm_per_h", mm_per_h, rain_severity)
+        return cls({"rain": 1.0}, severity, falling, variation)
+
+    @classmethod
+    def snow(
+        cls,
+        mm_per_h: tuple[float, float] = (0.4, 4.0),
+        *,
+        falling: float = 1.0,
+        variation: float = 1.0,
+    ) -> WeatherPolicy:
+        """Snow alone, of rates in a range in mm/h of water."""
+        severity = _severities("mm_per_h", mm_per_h, snow_severity)
+        return cls({"snow": 1.0}, severity, falling, variation)
+
+    @classmethod
+    def fog(
+        cls, visibility_m: tuple[float, float] = (50.0, 600.0), *, variation: float = 1.0
+    ) -> WeatherPolicy:
+        """Fog alone, of meteorological optical ranges in metres, given in either order."""
+        severity = _severities("visibility_m", visibility_m, fog_severity)
+        return cls({"fog": 1.0}, severity, variation=variation)
+
+    def with_clear(self, share: float) -> WeatherPolicy:
+        """The same weathers, with a share in [0, 1] of the draws left clear.
+
+        Raises:
+            ArgumentError: If the share is outside [0, 1], or below 1 and nothing else is drawn.
+        """
+        share = finite("share", share, 0, 1)
+        others = {name: weight for name, weight in self.types.items() if name != "clear"}
+        total = sum(others.values())
+        if total == 0 and share < 1:
+            raise ArgumentError("this policy draws clear weather alone; add types to it first")
+        scaled = {name: (1 - share) * weight / total for name, weight in others.items() if total}
+        return replace(self, types={"clear": share, **scaled})
+
+    def draw(self, seed: int, epoch: int, item: int, *, which: float | None = None) -> WeatherDraw:
+        """The weather of one item of one epoch.
+
+        Args:
+            seed: In [-2**63, 2**64), as are the next two.
+            epoch: Of the training.
+            item: Of the epoch.
+            which: In [0, 1), decides the type in place of the key's own number, for whoever deals
+                types out evenly; the rest of the draw stays what it is.
+        """
         key = key_of("weather-draw", seed, epoch, item)
-        which, how, falls, direction, particles = uniforms(key, 5)
-        kind = self._kind(which)
+        own, how, falls, direction, particles = uniforms(key, 5)
+        kind = self._kind(own if which is None else finite("which", which, 0, 1))
         severity = _triangular(float(how), *self.severity)
         falling = float(falls) < self.falling
         parts = [weather_of(part, severity, falling=falling) for part in kind.split("+")]
@@ -157,6 +211,18 @@ class WeatherPolicy:
                 f"WeatherPolicy has no field {printable(unknown[0])}; it has {', '.join(_FIELDS)}"
             )
         return cls(**state)
+
+
+def _severities(
+    name: str, values: tuple[float, float], severity_of: Callable[[float], float]
+) -> tuple[float, float]:
+    """A range of severities from one in a physical unit."""
+    try:
+        first, second = values
+    except (TypeError, ValueError):
+        raise ArgumentError(f"{name} must be a range (low, high), got {values!r}") from None
+    low, high = sorted((severity_of(first), severity_of(second)))
+    return low, high
 
 
 def _triangular(uniform: float, low: float, high: float) -> float:

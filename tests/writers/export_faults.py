@@ -5,78 +5,77 @@ from __future__ import annotations
 import os
 import signal
 import time
-from pathlib import Path
 from typing import Any
 
 from weather_aug.errors import OutputError
 from weather_aug.writers import worker
 
-DEADLY_ITEM = 4
-write_sample = worker.write_sample
+DEADLY_UNIT = 4
+write_unit = worker.write_unit
 
 
-def die_on_one_item(plan: Any, out: Path, pipe: Any) -> None:
-    """Be killed at DEADLY_ITEM, each time."""
+def die_on_one_item(plan: Any, target: Any, pipe: Any) -> None:
+    """Be killed at DEADLY_UNIT, each time."""
 
-    def deadly(plan: Any, out: Path, index: int) -> str:
-        if index == DEADLY_ITEM:
+    def deadly(plan: Any, target: Any, unit: int) -> list[str]:
+        if unit == DEADLY_UNIT:
             os.kill(os.getpid(), signal.SIGKILL)
-        return write_sample(plan, out, index)
+        return write_unit(plan, target, unit)
 
-    worker.write_sample = deadly
-    worker.work(plan, out, pipe)
+    worker.write_unit = deadly
+    worker.work(plan, target, pipe)
 
 
-def die_after_writing_once(plan: Any, out: Path, pipe: Any) -> None:
-    """Write the files of DEADLY_ITEM and be killed before saying so, the first time."""
+def die_after_writing_once(plan: Any, target: Any, pipe: Any) -> None:
+    """Write the files of DEADLY_UNIT and be killed before saying so, the first time."""
 
-    def deadly(plan: Any, out: Path, index: int) -> str:
-        line = write_sample(plan, out, index)
-        mark = out.parent / "died"
-        if index == DEADLY_ITEM and not mark.exists():
+    def deadly(plan: Any, target: Any, unit: int) -> list[str]:
+        lines = write_unit(plan, target, unit)
+        mark = target.state.parent / "died"
+        if unit == DEADLY_UNIT and not mark.exists():
             mark.touch()
             os.kill(os.getpid(), signal.SIGSEGV)
-        return line
+        return lines
 
-    worker.write_sample = deadly
-    worker.work(plan, out, pipe)
-
-
-def find_the_disk_full(plan: Any, out: Path, pipe: Any) -> None:
-    """Fail to write DEADLY_ITEM."""
-
-    def full(plan: Any, out: Path, index: int) -> str:
-        if index == DEADLY_ITEM:
-            raise OutputError(f"cannot write {out}: No space left on device")
-        return write_sample(plan, out, index)
-
-    worker.write_sample = full
-    worker.work(plan, out, pipe)
+    worker.write_unit = deadly
+    worker.work(plan, target, pipe)
 
 
-def run_out_of_memory(plan: Any, out: Path, pipe: Any) -> None:
-    """Raise MemoryError at DEADLY_ITEM, each time."""
+def find_the_disk_full(plan: Any, target: Any, pipe: Any) -> None:
+    """Fail to write DEADLY_UNIT."""
 
-    def large(plan: Any, out: Path, index: int) -> str:
-        if index == DEADLY_ITEM:
+    def full(plan: Any, target: Any, unit: int) -> list[str]:
+        if unit == DEADLY_UNIT:
+            raise OutputError(f"cannot write {target.state}: No space left on device")
+        return write_unit(plan, target, unit)
+
+    worker.write_unit = full
+    worker.work(plan, target, pipe)
+
+
+def run_out_of_memory(plan: Any, target: Any, pipe: Any) -> None:
+    """Raise MemoryError at DEADLY_UNIT, each time."""
+
+    def large(plan: Any, target: Any, unit: int) -> list[str]:
+        if unit == DEADLY_UNIT:
             raise MemoryError
-        return write_sample(plan, out, index)
+        return write_unit(plan, target, unit)
 
-    worker.write_sample = large
-    worker.work(plan, out, pipe)
+    worker.write_unit = large
+    worker.work(plan, target, pipe)
 
 
-def sleep_on_one_item(plan: Any, out: Path, pipe: Any) -> None:
-    """Be busy with DEADLY_ITEM for longer than any test."""
+def sleep_on_one_item(plan: Any, target: Any, pipe: Any) -> None:
+    """Be busy with DEADLY_UNIT for longer than any test."""
 
-    def slow(plan: Any, out: Path, index: int) -> str:
-        if index == DEADLY_ITEM:
+    def slow(plan: Any, target: Any, unit: int) -> list[str]:
+        if unit == DEADLY_UNIT:
             time.sleep(60)
-        return write_sample(plan, out, index)
+        return write_unit(plan, target, unit)
 
-    worker.write_sample = slow
-    worker.work(plan, out, pipe)
+    worker.write_unit = slow
+    worker.work(plan, target, pipe)
 
 
-def end_at_once(plan: Any, out: Path, pipe: Any) -> None:
+def end_at_once(plan: Any, target: Any, pipe: Any) -> None:
     """Never become ready."""

@@ -205,7 +205,7 @@ def started(
     """An exporter in a session of its own, its workers with a fault of `export_faults`."""
     script = out.parent / "script.py"
     script.write_text(SCRIPT)
-    policy = json.dumps(plan.policy.to_dict())
+    policy = json.dumps(plan.job["policy"])
     arguments = [plan.scenes[0].path, out, policy, plan.count, workers, fault]
     folders = (Path(__file__).parent, Path(weather_aug.__file__).parents[1])
     return subprocess.Popen(

@@ -86,7 +86,7 @@ def test_an_item_that_kills_its_workers_is_quarantined(
     expected_tree: dict[str, str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    item = export_faults.DEADLY_ITEM
+    item = export_faults.DEADLY_UNIT
     with monkeypatch.context() as patch:
         patch.setattr(engines, "work", fault)
         with pytest.raises(IntegrityError, match=rf"1 item\(s\) .* missing: {item} ") as caught:
@@ -108,7 +108,7 @@ def test_a_workers_error_ends_the_run_and_it_can_be_continued(
         with pytest.raises(OutputError, match="No space left on device"):
             export(plan, out, workers=2)
     assert multiprocessing.active_children() == []
-    assert export_faults.DEADLY_ITEM not in committed(out)
+    assert export_faults.DEADLY_UNIT not in committed(out)
     export(plan, out)
     assert tree_of(out) == expected_tree
 

@@ -18,6 +18,7 @@ from weather_aug import _files
 from weather_aug.errors import ArgumentError, ConflictError, IntegrityError, OutputError, SceneError
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.writers import engines, lock
+from weather_aug.writers.choices import FromPolicy
 from weather_aug.writers.export import export
 from weather_aug.writers.plan import ExportPlan, plan_export
 from weather_aug.writers.sample import encoded_parts, render_recipe
@@ -101,7 +102,7 @@ def test_a_finished_export_is_left_alone(
 ) -> None:
     export(plan, out)
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
-    monkeypatch.setattr(engines, "write_sample", refuse_to_render)
+    monkeypatch.setattr(engines, "write_unit", refuse_to_render)
     for verify in (False, True):
         assert export(plan, out, verify=verify).rendered == 0
     assert before == {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
@@ -243,15 +244,15 @@ def test_another_job_is_refused_by_its_first_differing_field(
     export(plan, out) if finished else interrupt_after(plan, out, 3)
     before = tree_of(out)
     changes: dict[str, Any] = {
-        "seed": {"seed": 4},
+        "seed": {"choice": FromPolicy(POLICY, 4)},
         "count": {"count": 11},
-        "policy": {"policy": replace(POLICY, falling=0.1)},
+        "policy": {"choice": FromPolicy(replace(POLICY, falling=0.1), 3)},
     }
     for field, change in changes.items():
         with pytest.raises(ConflictError, match=f"its {field} is"):
             export(replace(plan, **change), out)
     with pytest.raises(ConflictError, match="its policy is"):
-        export(replace(plan, policy=replace(POLICY, falling=0.1), seed=4), out)
+        export(replace(plan, choice=FromPolicy(replace(POLICY, falling=0.1), 4)), out)
     after = tree_of(out)
     after.pop(".export/lock", None), before.pop(".export/lock", None)
     assert after == before
@@ -287,7 +288,7 @@ def test_an_exporter_waits_for_the_workers_of_a_dead_one(
 def test_unusable_outputs_are_refused_before_the_first_render(
     plan: ExportPlan, scene: WeatherScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(engines, "write_sample", refuse_to_render)
+    monkeypatch.setattr(engines, "write_unit", refuse_to_render)
     file = tmp_path / "file"
     file.write_text("x")
     loop = tmp_path / "loop"

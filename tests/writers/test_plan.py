@@ -15,9 +15,12 @@ from tiny_export import POLICY, TinyClip
 
 from weather_aug.errors import ArgumentError, ConflictError, SceneError
 from weather_aug.render.options import RenderOptions
-from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.scene.scene import WeatherScene
+from weather_aug.writers.choices import FromPolicy
 from weather_aug.writers.plan import ExportPlan, plan_export
+
+REORDERED = {"rain": 2, "clear": 1, "snow": 2, "fog": 1}
+"""The types of POLICY in another order, which draws other weathers."""
 
 
 @pytest.fixture(scope="module")
@@ -90,11 +93,13 @@ def test_a_recipe_survives_json_exactly(plan: ExportPlan, index: int) -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"seed": 4},
+        {"choice": FromPolicy(POLICY, 4)},
         {"count": 11},
         {"options": RenderOptions(max_particles=5)},
-        {"policy": replace(POLICY, severity=(0.2, 1.0))},
-        {"policy": WeatherPolicy(types={"rain": 2, "clear": 1, "snow": 2, "fog": 1})},
+        {"choice": FromPolicy(replace(POLICY, severity=(0.2, 1.0)), 3)},
+        {"choice": FromPolicy(replace(POLICY, types=REORDERED), 3)},
+        {"parts": ("image", "label", "depth")},
+        {"split": "val"},
     ],
 )
 def test_what_decides_the_bytes_is_in_the_fingerprint(

@@ -1,8 +1,8 @@
 """Who renders the samples: this process, or worker processes that may die without harm.
 
-An engine gives (item, manifest line) in the order of completion; it writes samples, never the
-journal. Workers are started afresh (spawn), take one item at a time, and are told apart by their
-pipes, so that one that dies is noticed at once and costs at most the item it had.
+An engine gives (unit, manifest lines) in the order of completion; it writes samples, never the
+journal. Workers are started afresh (spawn), take one unit at a time, and are told apart by their
+pipes, so that one that dies is noticed at once and costs at most the unit it had.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from collections import Counter
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from multiprocessing import connection
-from pathlib import Path
 from typing import Any
 
 from weather_aug import _files
@@ -21,39 +20,41 @@ from weather_aug.errors import IntegrityError, WeatherAugError
 from weather_aug.render.compose import warm_up
 from weather_aug.writers import layout
 from weather_aug.writers.plan import ExportPlan
-from weather_aug.writers.sample import write_sample
+from weather_aug.writers.sample import write_unit
+from weather_aug.writers.target import Target
 from weather_aug.writers.worker import DONE, FAILED, READY, work
 
 MAX_RETRIES = 2
-"""How often an item whose worker died is given to a fresh one."""
+"""How often a unit whose worker died is given to a fresh one."""
 MAX_QUARANTINED = 8
-"""Items lost after which it is the machine that is at fault, and the run ends."""
+"""Units lost after which it is the machine that is at fault, and the run ends."""
 MAX_FAILED_STARTS = 3
 LISTEN_S = 2.0
 STOP_WAIT_S = 5.0
 
-Finished = tuple[int, str]
+Finished = tuple[int, list[str]]
+"""A unit, and its items' lines of the manifest."""
 
 
 def run_inline(
-    plan: ExportPlan, out: Path, items: Iterator[int]
+    plan: ExportPlan, target: Target, units: Iterator[int]
 ) -> Generator[Finished, None, None]:
-    """Render items one after the other in this process."""
-    for index in items:
-        yield index, write_sample(plan, out, index)
+    """Render units one after the other in this process."""
+    for unit in units:
+        yield unit, write_unit(plan, target, unit)
 
 
 def run_processes(
-    plan: ExportPlan, out: Path, items: Iterator[int], workers: int
+    plan: ExportPlan, target: Target, units: Iterator[int], workers: int
 ) -> Generator[Finished, None, None]:
-    """Render items in `workers` processes.
+    """Render units in `workers` processes.
 
     Raises:
-        IntegrityError: After all other items, if an item killed three workers; it names them.
+        IntegrityError: After all other units, if one killed three workers; it names its items.
         WeatherAugError: If workers cannot be started, or the first error of a worker.
     """
     warm_up()
-    crew = _Crew(plan, out, items)
+    crew = _Crew(plan, target, units)
     try:
         for _ in range(workers):
             crew.start(None)
@@ -70,38 +71,38 @@ class _Member:
 
     process: Any
     pipe: connection.Connection
-    item: int | None
-    """The item that it has, or gets as soon as it is ready."""
+    unit: int | None
+    """The unit that it has, or gets as soon as it is ready."""
     ready: bool = False
 
 
 class _Crew:
-    """The workers at one output and the items still to be given to them."""
+    """The workers at one output and the units still to be given to them."""
 
-    def __init__(self, plan: ExportPlan, out: Path, items: Iterator[int]) -> None:
+    def __init__(self, plan: ExportPlan, target: Target, units: Iterator[int]) -> None:
         self.members: list[_Member] = []
-        self._plan, self._out, self._items = plan, out, items
+        self._plan, self._target, self._units = plan, target, units
         self._context = multiprocessing.get_context("spawn")
         self._deaths: Counter[int] = Counter()
         self._lost: list[int] = []
         self._failed_starts = 0
 
-    def start(self, item: int | None) -> None:
-        """Start a worker that gets `item`, or the next one if None; none if nothing is left."""
-        item = next(self._items, None) if item is None else item
-        if item is None:
+    def start(self, unit: int | None) -> None:
+        """Start a worker that gets `unit`, or the next one if None; none if nothing is left."""
+        unit = next(self._units, None) if unit is None else unit
+        if unit is None:
             return
         ours, theirs = self._context.Pipe()
         process = self._context.Process(
-            target=work, args=(self._plan, self._out, theirs), daemon=True, name="export worker"
+            target=work, args=(self._plan, self._target, theirs), daemon=True, name="export worker"
         )
         process.start()
         # The worker's copy must be the only one, or its death would not close the pipe.
         theirs.close()
-        self.members.append(_Member(process, ours, item))
+        self.members.append(_Member(process, ours, unit))
 
     def finished(self) -> Iterator[Finished]:
-        """Wait until a worker says something or dies; give the items that were finished."""
+        """Wait until a worker says something or dies; give the units that were finished."""
         heard = connection.wait([member.pipe for member in self.members], LISTEN_S)
         for member in self.members.copy():
             if member.pipe not in heard:
@@ -116,12 +117,12 @@ class _Crew:
                 continue
             if kind == FAILED:
                 raise _with_note(*value)
-            done = member.item
+            done = member.unit
             if kind == READY:
                 member.ready, self._failed_starts = True, 0
             else:
                 assert kind == DONE
-                member.item = next(self._items, None)
+                member.unit = next(self._units, None)
             self._assign(member)
             if kind == DONE and done is not None:
                 yield done, value
@@ -136,27 +137,27 @@ class _Crew:
         self.members.clear()
 
     def raise_if_lost(self) -> None:
-        """Name the items that no worker survived, if there are any."""
+        """Name the items of units that no worker survived, if there are any."""
         if not self._lost:
             return
-        recipes = [{"item": index, "recipe": self._plan.recipe(index)} for index in self._lost]
-        lines = [json.dumps(recipe) for recipe in recipes]
-        path = self._out / layout.QUARANTINE
+        items = [index for unit in self._lost for index in self._plan.items_of(unit)]
+        lines = [json.dumps({"item": k, "recipe": self._plan.recipe(k)}) for k in items]
+        path = self._target.state / layout.QUARANTINE
         _files.write_whole(path, ("\n".join(lines) + "\n").encode())
         raise IntegrityError(
             f"{len(lines)} item(s) killed {MAX_RETRIES + 1} workers each and are missing: "
-            f"{', '.join(str(index) for index in self._lost)} (recipes in {path}); the first is "
+            f"{', '.join(str(index) for index in items)} (recipes in {path}); the first is "
             f"{lines[0]}; free memory or use fewer workers, then run it again to continue"
         )
 
     def _assign(self, member: _Member) -> None:
-        """Hand a worker its item; one without an item goes home."""
+        """Hand a worker its unit; one without any goes home."""
         try:
-            member.pipe.send(member.item)
+            member.pipe.send(member.unit)
         except OSError:
-            # It died just now: its pipe says so in the next round, with the item still its own.
+            # It died just now: its pipe says so in the next round, with the unit still its own.
             return
-        if member.item is None:
+        if member.unit is None:
             self._dismiss(member)
 
     def _dismiss(self, member: _Member) -> None:
@@ -165,9 +166,9 @@ class _Crew:
         self.members.remove(member)
 
     def _bury(self, member: _Member) -> None:
-        """Replace a worker that died, and count its death against the item that it had."""
+        """Replace a worker that died, and count its death against the unit that it had."""
         self._dismiss(member)
-        item = member.item
+        unit = member.unit
         if not member.ready:
             self._failed_starts += 1
             if self._failed_starts >= MAX_FAILED_STARTS:
@@ -176,14 +177,14 @@ class _Crew:
                     "a script that exports must stand under `if __name__ == '__main__':`; with "
                     "workers=1 it runs without them"
                 )
-        elif item is not None:
-            self._deaths[item] += 1
-            if self._deaths[item] > MAX_RETRIES:
-                self._lost.append(item)
-                item = None
+        elif unit is not None:
+            self._deaths[unit] += 1
+            if self._deaths[unit] > MAX_RETRIES:
+                self._lost.append(unit)
+                unit = None
             if len(self._lost) >= MAX_QUARANTINED:
                 self.raise_if_lost()
-        self.start(item)
+        self.start(unit)
 
 
 def _with_note(error: Exception, trace: str) -> Exception:

@@ -24,6 +24,7 @@ from weather_aug.writers.journal import Journal, job_of, write_journal
 from weather_aug.writers.lock import check_output, exclusive
 from weather_aug.writers.manifest import finish, is_finished_whole, usable_lines
 from weather_aug.writers.plan import ExportPlan
+from weather_aug.writers.target import LocalFolder, Target
 
 MAX_WORKERS = 1024
 
@@ -83,17 +84,18 @@ def export(
     if not 0 <= check_seed("workers", workers) <= MAX_WORKERS:
         raise ArgumentError(f"workers must be in [0, {MAX_WORKERS}], got {workers}")
     out = check_output(Path(out), [scene.path for scene in plan.scenes])
+    target = LocalFolder(out)
     plan.check_scenes()
     rendered = damaged = 0
     with exclusive(out):
-        _remove_leftovers(out)
-        contents = _finished(plan, out, verify, progress)
+        target.remove_leftovers(plan.layout)
+        contents = _finished(plan, target, verify, progress)
         if contents is None:
-            with Journal(out / layout.JOURNAL, plan, out, progress=progress) as journal:
+            with Journal(plan, target, progress=progress) as journal:
                 damaged = journal.damaged
-                _make_folders(plan, out)
-                rendered = _render(plan, out, journal, workers, progress, on_sample)
-                contents = finish(plan, out, journal)
+                target.make_folders(plan.folders())
+                rendered = _render(plan, target, journal, workers, progress, on_sample)
+                contents = finish(plan, target, journal)
         with _files.reported(out):
             for name in (layout.QUARANTINE, layout.JOURNAL):
                 (out / name).unlink(missing_ok=True)
@@ -110,8 +112,11 @@ def export(
     )
 
 
-def _finished(plan: ExportPlan, out: Path, verify: bool, progress: bool) -> dict[str, Any] | None:
+def _finished(
+    plan: ExportPlan, target: Target, verify: bool, progress: bool
+) -> dict[str, Any] | None:
     """`export.json` of a whole export, or None; then there is a journal of the job to continue."""
+    out = target.state
     path = out / layout.JOURNAL
     if not (out / layout.CONTENTS).exists():
         if path.exists():
@@ -121,7 +126,7 @@ def _finished(plan: ExportPlan, out: Path, verify: bool, progress: bool) -> dict
         return None
     contents = _contents(out)
     _check_job(plan, contents["job"], out)
-    if is_finished_whole(out, contents, digests=verify, progress=progress):
+    if is_finished_whole(target, contents, digests=verify, progress=progress):
         return contents
     write_journal(path, plan.job, usable_lines(out, contents))
     with _files.reported(out):
@@ -159,30 +164,9 @@ def _text(value: Any) -> str:
     return json.dumps(value)
 
 
-def _remove_leftovers(out: Path) -> None:
-    """Remove temporary files of an exporter that was killed."""
-    with _files.reported(out):
-        for folder in (out, out / layout.STATE):
-            for path in folder.glob(f"*{_files.TEMPORARY_SUFFIX}"):
-                path.unlink()
-        for root in layout.SAMPLE_ROOTS:
-            for path in (out / root).rglob(f"*.png{_files.TEMPORARY_SUFFIX}"):
-                path.unlink()
-
-
-def _make_folders(plan: ExportPlan, out: Path) -> None:
-    with _files.reported(out):
-        for relative in plan.folders():
-            folder = out / relative
-            folder.mkdir(parents=True, exist_ok=True)
-            while folder != out:
-                folder = folder.parent
-                _files.sync_folder(folder)
-
-
 def _render(
     plan: ExportPlan,
-    out: Path,
+    target: Target,
     journal: Journal,
     workers: int,
     progress: bool,
@@ -195,7 +179,7 @@ def _render(
         return 0
     rendered = 0
     with (
-        closing(_engine(plan, out, journal.missing(), workers)) as finished,
+        closing(_engine(plan, target, journal.missing(), workers)) as finished,
         tqdm(
             total=plan.count,
             initial=journal.committed,
@@ -204,18 +188,19 @@ def _render(
             disable=not progress,
         ) as bar,
     ):
-        for index, line in finished:
-            journal.append(index, line)
-            rendered += 1
-            bar.update()
+        for unit, lines in finished:
+            made = journal.append(unit, lines)
+            rendered += len(made)
+            bar.update(len(made))
             if on_sample is not None:
-                on_sample(json.loads(line))
+                for line in made:
+                    on_sample(json.loads(line))
     return rendered
 
 
 def _engine(
-    plan: ExportPlan, out: Path, items: Iterator[int], workers: int
+    plan: ExportPlan, target: Target, units: Iterator[int], workers: int
 ) -> Generator[Finished, None, None]:
     if workers <= 1:
-        return run_inline(plan, out, items)
-    return run_processes(plan, out, items, workers)
+        return run_inline(plan, target, units)
+    return run_processes(plan, target, units, workers)

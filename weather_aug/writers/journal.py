@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -19,7 +19,9 @@ import numpy as np
 
 from weather_aug import _files
 from weather_aug.errors import DataError, IntegrityError, printable
+from weather_aug.writers import layout
 from weather_aug.writers.plan import ExportPlan
+from weather_aug.writers.target import Target
 
 SYNC_EVERY = 64
 """Lines between two syncs to disk: what a power cut can cost; a killed process loses none."""
@@ -63,18 +65,9 @@ def write_journal(path: Path, job: dict[str, Any], lines: Iterable[str] = ()) ->
             file.write(sealed(line))
 
 
-def is_whole(out: Path, files: dict[str, Any], *, digests: bool) -> bool:
+def is_whole(target: Target, files: dict[str, Any], *, digests: bool) -> bool:
     """Whether a sample's files are there with their sizes and (`digests`) their bytes."""
-    for entry in files.values():
-        try:
-            path = _files.file_inside(out, entry["path"])
-            if path.stat().st_size != entry["size"]:
-                return False
-            if digests and _files.sha256_of_file(path) != entry["sha256"]:
-                return False
-        except (DataError, OSError):
-            return False
-    return True
+    return all(target.is_whole(file["path"], file, digests=digests) for file in files.values())
 
 
 class Journal:
@@ -83,16 +76,19 @@ class Journal:
     It keeps one offset an item in memory, not the lines.
     """
 
-    def __init__(self, path: Path, plan: ExportPlan, out: Path, *, progress: bool = False) -> None:
-        """Open a journal; lines whose files are not whole are dropped from it.
+    def __init__(self, plan: ExportPlan, target: Target, *, progress: bool = False) -> None:
+        """Open the journal of an output; lines whose files are not whole are dropped from it.
 
         Raises:
             OutputError: If it cannot be written.
         """
-        self.path = path
+        self.path = path = target.state / layout.JOURNAL
+        self._plan = plan
         self._offsets = np.full(plan.count, -1, np.int64)
+        self.committed = 0
+        """How many items are committed."""
         self._unsynced = 0
-        lines = _Kept(path, plan, out, progress)
+        lines = _Kept(path, plan, target, progress)
         write_journal(path, plan.job, lines)
         self.damaged = lines.dropped
         with _files.reported(path), ExitStack() as opened:
@@ -102,30 +98,39 @@ class Journal:
             self._index_lines()
             self._opened = opened.pop_all()
 
-    @property
-    def committed(self) -> int:
-        """How many items are committed."""
-        return int(np.count_nonzero(self._offsets >= 0))
-
     def missing(self) -> Iterator[int]:
-        """Items that are not committed, in order."""
-        return (index for index in range(len(self._offsets)) if self._offsets[index] < 0)
+        """Units with an item that is not committed, in order."""
+        for unit in range(self._plan.units):
+            items = self._plan.items_of(unit)
+            if (self._offsets[items.start : items.stop] < 0).any():
+                yield unit
 
-    def append(self, index: int, line: str) -> None:
-        """Commit an item.
+    def append(self, unit: int, lines: Sequence[str]) -> list[str]:
+        """Commit a unit; those of its items that were committed before stay as they are.
+
+        Returns:
+            The lines that are newly committed.
 
         Raises:
-            OutputError: If the line cannot be written; the item is then not committed.
+            OutputError: If a line cannot be written; its item is then not committed.
         """
+        items = zip(self._plan.items_of(unit), lines, strict=True)
+        new = [(index, line) for index, line in items if self._offsets[index] < 0]
         with _files.reported(self.path):
-            offset = self._file.tell()
-            rest = memoryview(sealed(line))
-            while rest:
-                rest = rest[self._file.write(rest) :]
-            self._offsets[index] = offset
-            self._unsynced += 1
-            if self._unsynced >= SYNC_EVERY:
-                self._sync()
+            for index, line in new:
+                self._append(index, line)
+        return [line for _, line in new]
+
+    def _append(self, index: int, line: str) -> None:
+        offset = self._file.tell()
+        rest = memoryview(sealed(line))
+        while rest:
+            rest = rest[self._file.write(rest) :]
+        self._offsets[index] = offset
+        self.committed += 1
+        self._unsynced += 1
+        if self._unsynced >= SYNC_EVERY:
+            self._sync()
 
     def line(self, index: int) -> str:
         """A committed item's line of the manifest.
@@ -168,6 +173,7 @@ class Journal:
             text = unsealed(line)
             assert text is not None
             self._offsets[json.loads(text)["item"]] = offset
+            self.committed += 1
             offset += len(line)
         self._file.seek(0, os.SEEK_END)
 
@@ -175,8 +181,8 @@ class Journal:
 class _Kept:
     """The lines of an interrupted journal whose files are whole; counts the others."""
 
-    def __init__(self, path: Path, plan: ExportPlan, out: Path, progress: bool) -> None:
-        self._path, self._plan, self._out, self._progress = path, plan, out, progress
+    def __init__(self, path: Path, plan: ExportPlan, target: Target, progress: bool) -> None:
+        self._path, self._plan, self._target, self._progress = path, plan, target, progress
         self.dropped = 0
 
     def __iter__(self) -> Iterator[str]:
@@ -203,4 +209,4 @@ class _Kept:
             in_plan = 0 <= index < self._plan.count and paths == self._plan.paths(index)
         except (DataError, KeyError, TypeError, ValueError, AttributeError):
             return None
-        return index if in_plan and is_whole(self._out, files, digests=True) else None
+        return index if in_plan and is_whole(self._target, files, digests=True) else None

@@ -1,8 +1,8 @@
 """What an export's files are called; checkers need it too, so it imports nothing heavy.
 
-leftImg8bit/train/<scene>/<base>_leftImg8bit.png            the picture in weather
-gtFine/train/<scene>/<base>_gtFine_labelTrainIds.png        train ids, where there are labels
-sample_class_stats.json  sample_class_stats_dict.json  samples_with_class.json
+Samples stand where their layout says (see `LAYOUTS`); at the root stand
+
+sample_class_stats.json  sample_class_stats_dict.json  samples_with_class.json    where trainers ask
 manifest.jsonl                                              one line a sample, in item order
 export.json                                                 the job, counts, digests
 .export/                                                    lock and journal, until it is done
@@ -11,15 +11,16 @@ export.json                                                 the job, counts, dig
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from weather_aug import _files
-from weather_aug.errors import DataError, IntegrityError, printable
+from weather_aug.errors import ArgumentError, DataError, IntegrityError, printable
 
 FORMAT = "weather_aug export"
-VERSION = 1
-LAYOUT = "cityscapes"
+VERSION = 2
 
 CONTENTS = "export.json"
 MANIFEST = "manifest.jsonl"
@@ -31,14 +32,63 @@ STATE = ".export"
 JOURNAL = f"{STATE}/journal"
 QUARANTINE = f"{STATE}/quarantine.jsonl"
 
-PART_FOLDERS = {"image": "leftImg8bit/train", "label": "gtFine/train"}
-PART_SUFFIXES = {"image": "_leftImg8bit.png", "label": "_gtFine_labelTrainIds.png"}
-SAMPLE_ROOTS = tuple(folder.split("/")[0] for folder in PART_FOLDERS.values())
+PARTS = ("image", "label", "invalid", "transmittance", "depth")
+"""What a sample may consist of; label, invalid and depth where the scene knows them."""
 
 
-def part_path(part: str, scene_name: str, base_name: str) -> str:
-    """Path of a sample's `image` or `label`, relative to the export."""
-    return f"{PART_FOLDERS[part]}/{scene_name}/{base_name}{PART_SUFFIXES[part]}"
+@dataclass(frozen=True)
+class Layout:
+    """Where the parts of a sample stand, for whom."""
+
+    name: str
+    paths: Mapping[str, str]
+    """Path of each part, of `{split}`, `{scene}` (folders) and `{base}` (unique in the export)."""
+    parts: tuple[str, ...]
+    """Parts that are written if nobody chooses."""
+    has_class_stats: bool
+    """Whether the files of rare-class sampling are written, too."""
+    items_per_unit: int = 1
+    """Samples that are committed together: 1, or the samples of a tar."""
+
+    def path(self, part: str, *, split: str, scene: str, base: str) -> str:
+        """Path of a sample's part, relative to the export."""
+        return self.paths[part].format(split=split, scene=scene, base=base)
+
+    @property
+    def roots(self) -> tuple[str, ...]:
+        """Top folders that samples stand in."""
+        return tuple(dict.fromkeys(path.split("/")[0] for path in self.paths.values()))
+
+
+LAYOUTS = {
+    layout.name: layout
+    for layout in (
+        Layout(
+            "cityscapes",
+            {
+                "image": "leftImg8bit/{split}/{scene}/{base}_leftImg8bit.png",
+                "label": "gtFine/{split}/{scene}/{base}_gtFine_labelTrainIds.png",
+                "invalid": "gtFine/{split}/{scene}/{base}_gtFine_invIds.png",
+                "transmittance": "transmittance/{split}/{scene}/{base}_transmittance.png",
+                "depth": "depth/{split}/{scene}/{base}_depth.png",
+            },
+            ("image", "label"),
+            has_class_stats=True,
+        ),
+    )
+}
+"""By name."""
+
+
+def layout_called(name: str) -> Layout:
+    """The layout of a name.
+
+    Raises:
+        ArgumentError: If there is none.
+    """
+    if name not in LAYOUTS:
+        raise ArgumentError(f"layout {printable(name)!r} is not one of {', '.join(LAYOUTS)}")
+    return LAYOUTS[name]
 
 
 def sealed_contents(contents: dict[str, Any]) -> bytes:

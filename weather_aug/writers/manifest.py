@@ -14,9 +14,10 @@ from weather_aug.writers import layout
 from weather_aug.writers.cityscapes import ClassStats
 from weather_aug.writers.journal import Journal, is_whole
 from weather_aug.writers.plan import ExportPlan
+from weather_aug.writers.target import Target
 
 
-def finish(plan: ExportPlan, out: Path, journal: Journal) -> dict[str, Any]:
+def finish(plan: ExportPlan, target: Target, journal: Journal) -> dict[str, Any]:
     """Write manifest, class statistics and `export.json` from a journal of all items.
 
     Returns:
@@ -25,6 +26,7 @@ def finish(plan: ExportPlan, out: Path, journal: Journal) -> dict[str, Any]:
     Raises:
         OutputError: If a file cannot be written.
     """
+    out = target.state
     stats = ClassStats(plan.count)
     counts: Counter[str] = Counter()
     kinds: Counter[str] = Counter()
@@ -38,7 +40,7 @@ def finish(plan: ExportPlan, out: Path, journal: Journal) -> dict[str, Any]:
             counts["labelled"] += "label" in entry["files"]
             counts["bytes"] += sum(part["size"] for part in entry["files"].values())
     names = [layout.MANIFEST]
-    if counts["labelled"]:
+    if counts["labelled"] and plan.layout.has_class_stats:
         names += stats.write(out, lambda index: plan.paths(index).get("label"))
     contents = {
         "format": layout.FORMAT,
@@ -56,7 +58,7 @@ def finish(plan: ExportPlan, out: Path, journal: Journal) -> dict[str, Any]:
 
 
 def is_finished_whole(
-    out: Path, contents: dict[str, Any], *, digests: bool, progress: bool = False
+    target: Target, contents: dict[str, Any], *, digests: bool, progress: bool = False
 ) -> bool:
     """Whether all files of a finished export are there with their sizes and (`digests`) bytes.
 
@@ -64,6 +66,7 @@ def is_finished_whole(
     """
     from tqdm.auto import tqdm
 
+    out = target.state
     if not all(_root_is_whole(out, name, file) for name, file in contents["files"].items()):
         return False
     lines = tqdm(
@@ -73,7 +76,7 @@ def is_finished_whole(
         unit="sample",
         disable=not progress,
     )
-    return all(is_whole(out, json.loads(line)["files"], digests=digests) for line in lines)
+    return all(is_whole(target, json.loads(line)["files"], digests=digests) for line in lines)
 
 
 def usable_lines(out: Path, contents: dict[str, Any]) -> Iterator[str]:

@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 import json
+import re
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from itertools import accumulate
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 import weather_aug
 from weather_aug import _files
-from weather_aug._keys import check_seed, key_of, uniforms
+from weather_aug._keys import check_seed
 from weather_aug.clip.types import FrameKey
 from weather_aug.errors import ArgumentError, ConflictError, printable
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene import store
 from weather_aug.scene.policy import WeatherDraw, WeatherPolicy
 from weather_aug.scene.scene import WeatherScene
-from weather_aug.writers import layout, png
+from weather_aug.writers import png
+from weather_aug.writers.choices import Choice, FromPolicy
+from weather_aug.writers.layout import PARTS, VERSION, Layout, layout_called
 
 MAX_COUNT = 100_000_000
 
@@ -41,16 +41,19 @@ class ExportPlan:
     """A fixed list of samples, as a function of the item's index; see `plan_export`.
 
     Convention:
-        Item i depends on (scenes, policy, seed, i) alone. Items run through all frames of all
-        scenes in a shuffled order, then through all of them again in another, so that any `count`
-        shows every frame equally often, to within one.
+        Item i depends on (scenes, choice, i) alone. Items are committed in units: each on its own,
+        or, where a layout packs them, as many as a pack holds.
     """
 
     scenes: tuple[WeatherScene, ...]
-    policy: WeatherPolicy
+    choice: Choice
     count: int
-    seed: int
     options: RenderOptions
+    layout: Layout
+    parts: tuple[str, ...]
+    """Of `layout.PARTS`, in their order."""
+    split: str
+    """Folder such as train or val."""
     scene_digests: tuple[str, ...]
     """As planned; a scene that is rebuilt meanwhile is noticed by them."""
 
@@ -68,13 +71,14 @@ class ExportPlan:
             for scene, digest in zip(self.scenes, self.scene_digests, strict=True)
         ]
         return {
-            "layout": layout.LAYOUT,
-            "format_version": layout.VERSION,
+            "layout": self.layout.name,
+            "parts": list(self.parts),
+            "split": self.split,
+            "format_version": VERSION,
             "package_version": weather_aug.__version__,
             "encoder": png.ENCODER,
             "scenes": scenes,
-            "policy": self.policy.to_dict(),
-            "seed": self.seed,
+            **self.choice.to_dict(),
             "count": self.count,
             "options": self.options.to_dict(),
         }
@@ -90,20 +94,33 @@ class ExportPlan:
         Raises:
             ArgumentError: If there is no such item.
         """
-        scene_index, record = self._frame(index)
-        return PlannedItem(index, scene_index, record.key, self.policy.draw(self.seed, 0, index))
+        scene_index, record, draw = self._chosen(index)
+        return PlannedItem(index, scene_index, record.key, draw)
 
     def paths(self, index: int) -> dict[str, str]:
-        """Relative path of each part of an item: `image`, and `label` if its frame has one.
+        """Relative path of each part of an item; there is no `label` where its frame has none.
 
         Base names carry the job's digest and the item, so they stay unique when exports of several
         jobs are merged or two scenes share a name.
         """
-        scene_index, record = self._frame(index)
-        name = self.scenes[scene_index].name
-        base = f"{name}_{self.digest[:8]}_{index:06d}_{record.key}"
-        parts = ("image", "label") if "label" in record.files else ("image",)
-        return {part: layout.part_path(part, name, base) for part in parts}
+        scene_index, record, _ = self._chosen(index)
+        scene = self.scenes[scene_index].name
+        base = f"{scene}_{self.digest[:8]}_{index:06d}_{record.key}"
+        return {
+            part: self.layout.path(part, split=self.split, scene=scene, base=base)
+            for part in self.parts
+            if part != "label" or "label" in record.files
+        }
+
+    @property
+    def units(self) -> int:
+        """How many units of work there are."""
+        return -(-self.count // self.layout.items_per_unit)
+
+    def items_of(self, unit: int) -> range:
+        """The items that are committed together as one unit."""
+        size = self.layout.items_per_unit
+        return range(unit * size, min((unit + 1) * size, self.count))
 
     def recipe(self, index: int) -> dict[str, Any]:
         """What an item is made from, as JSON values; `render_recipe` makes it again."""
@@ -119,7 +136,7 @@ class ExportPlan:
             "seed": item.draw.seed,
             "options": self.options.to_dict(),
             "package_version": weather_aug.__version__,
-            "format_version": layout.VERSION,
+            "format_version": VERSION,
         }
 
     def folders(self) -> list[str]:
@@ -127,8 +144,10 @@ class ExportPlan:
         found: dict[str, None] = {}
         for scene in self.scenes:
             labelled = any("label" in record.files for record in scene.manifest.frames)
-            for part in ("image", "label") if labelled else ("image",):
-                found[f"{layout.PART_FOLDERS[part]}/{scene.name}"] = None
+            for part in self.parts:
+                if part != "label" or labelled:
+                    path = self.layout.path(part, split=self.split, scene=scene.name, base="_")
+                    found[path.rpartition("/")[0]] = None
         return list(found)
 
     def check_scenes(self) -> None:
@@ -144,15 +163,13 @@ class ExportPlan:
                     "export it again, to another folder"
                 )
 
-    def _frame(self, index: int) -> tuple[int, store.FrameRecord]:
+    def _chosen(self, index: int) -> tuple[int, store.FrameRecord, WeatherDraw]:
         if not 0 <= index < self.count:
             raise ArgumentError(f"item must be in [0, {self.count}), got {index}")
-        frames = self._starts[-1]
-        cycle, place = divmod(index, frames)
-        frame = int(_shuffled(self.seed, cycle, frames)[place])
+        frame, draw = self.choice.item(index, self._starts[-1])
         scene_index = bisect_right(self._starts, frame) - 1
         offset = frame - self._starts[scene_index]
-        return scene_index, self.scenes[scene_index].manifest.frames[offset]
+        return scene_index, self.scenes[scene_index].manifest.frames[offset], draw
 
     @cached_property
     def _starts(self) -> tuple[int, ...]:
@@ -167,6 +184,9 @@ def plan_export(
     count: int,
     seed: int,
     options: RenderOptions = DEFAULT_OPTIONS,
+    layout: str = "cityscapes",
+    parts: Sequence[str] | None = None,
+    split: str = "train",
 ) -> ExportPlan:
     """Plan `count` samples of `scenes` in weathers drawn from `policy`.
 
@@ -176,22 +196,57 @@ def plan_export(
         count: Number of samples, less or more than there are frames.
         seed: Of the order and the weathers.
         options: Budget of a rendering.
+        layout: Where files stand, a name of `layout.LAYOUTS`.
+        parts: What a sample consists of, of `layout.PARTS`; the layout's own if None.
+        split: Folder such as train or val.
 
     Raises:
-        ArgumentError: If there are no scenes, or count or seed are out of range.
+        ArgumentError: If there are no scenes, or an argument is out of range.
         SceneError: If a scene cannot be read.
     """
+    choice = FromPolicy(policy, check_seed("seed", seed))
+    return planned(scenes, choice, count, options, layout, parts, split)
+
+
+def planned(
+    scenes: Sequence[WeatherScene],
+    choice: Choice,
+    count: int,
+    options: RenderOptions,
+    layout: str,
+    parts: Sequence[str] | None,
+    split: str,
+) -> ExportPlan:
+    """A plan of checked arguments; see `plan_export`."""
     scenes = tuple(scenes)
     if not scenes:
         raise ArgumentError("scenes is empty; give at least one scene to export")
     if not 1 <= check_seed("count", count) <= MAX_COUNT:
         raise ArgumentError(f"count must be in [1, {MAX_COUNT}], got {count!r}")
     digests = tuple(scene.digest for scene in scenes)
-    return ExportPlan(scenes, policy, int(count), check_seed("seed", seed), options, digests)
+    chosen = layout_called(layout)
+    return ExportPlan(
+        *(scenes, choice, int(count), options, chosen, _parts_of(parts, chosen)),
+        *(_folder_name("split", split), digests),
+    )
 
 
-@lru_cache(maxsize=4)
-def _shuffled(seed: int, cycle: int, frames: int) -> NDArray[np.int64]:
-    order = np.argsort(uniforms(key_of("export-order", seed, cycle), frames), kind="stable")
-    order.flags.writeable = False
-    return order
+def _parts_of(parts: Sequence[str] | None, layout: Layout) -> tuple[str, ...]:
+    wanted = set(layout.parts if parts is None else parts)
+    unknown = sorted(wanted - set(layout.paths), key=str)
+    if unknown:
+        raise ArgumentError(
+            f"parts: {printable(unknown[0])!r} is no part of layout {layout.name}; there are "
+            f"{', '.join(layout.paths)}"
+        )
+    if "image" not in wanted:
+        raise ArgumentError("parts must hold 'image'")
+    return tuple(part for part in PARTS if part in wanted)
+
+
+def _folder_name(name: str, value: str) -> str:
+    if not isinstance(value, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", value):
+        raise ArgumentError(
+            f"{name} must be a plain folder name such as train, got {printable(value)!r}"
+        )
+    return value

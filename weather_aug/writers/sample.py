@@ -1,10 +1,9 @@
-"""One sample: rendered from its recipe, encoded, written whole."""
+"""One unit of work: samples rendered from their recipes, encoded, written whole."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,12 @@ from weather_aug.scene.viewpoint import Viewpoint
 from weather_aug.taxonomy import CLASSES
 from weather_aug.weather import Weather
 from weather_aug.writers.plan import ExportPlan
+from weather_aug.writers.target import Target
+
+DEPTH_STEPS_PER_M = 256.0
+
+Encoded = dict[str, bytes]
+"""Bytes of each part of a sample, by name."""
 
 
 def render_recipe(scene: WeatherScene, recipe: Mapping[str, Any]) -> RenderedFrame:
@@ -49,38 +54,71 @@ def render_recipe(scene: WeatherScene, recipe: Mapping[str, Any]) -> RenderedFra
     )
 
 
-def encoded_parts(shot: RenderedFrame) -> dict[str, bytes]:
-    """PNG bytes of each part: `image`, and `label` where the frame is labelled."""
-    parts = {"image": png_bytes(shot.image)}
-    if shot.label is not None:
-        parts["label"] = png_bytes(shot.label)
-    return parts
+def encoded_parts(shot: RenderedFrame, parts: Sequence[str] = ("image", "label")) -> Encoded:
+    """PNG bytes of each part; no `label` where the frame has none.
+
+    Image RGB, label and invalid 8 bits; transmittance 16 bits of a share (65535 is all); depth 16
+    bits in 1/256 m, as KITTI's, with 0 for the sky and what is farther than 255.9 m.
+    """
+    made = {}
+    for part in parts:
+        plane = None if part == "label" and shot.label is None else _PLANES[part](shot)
+        if plane is not None:
+            made[part] = png_bytes(plane)
+    return made
 
 
-def write_sample(plan: ExportPlan, out: Path, index: int) -> str:
-    """Render an item, write its files, and give its line of the manifest.
+def _transmittance_16(shot: RenderedFrame) -> NDArray[np.uint16]:
+    return np.rint(shot.transmittance * np.float32(65535)).astype(np.uint16)
 
-    The files are durable when this returns, but they count only once the line is in the journal.
+
+def _depth_16(shot: RenderedFrame) -> NDArray[np.uint16]:
+    steps = np.rint(shot.depth.astype(np.float32) * np.float32(DEPTH_STEPS_PER_M))
+    return np.where(steps <= 65535, steps, 0).astype(np.uint16)
+
+
+_PLANES: dict[str, Callable[[RenderedFrame], Any]] = {
+    "image": lambda shot: shot.image,
+    "label": lambda shot: shot.label,
+    "invalid": lambda shot: shot.invalid,
+    "transmittance": _transmittance_16,
+    "depth": _depth_16,
+}
+
+
+def write_unit(plan: ExportPlan, target: Target, unit: int) -> list[str]:
+    """Render the items of a unit, write their files, and give their lines of the manifest.
+
+    The files are durable when this returns, but they count only once the lines are in the journal.
 
     Raises:
         SceneError: If the scene cannot be read.
         OutputError: If a file cannot be written.
     """
-    recipe = plan.recipe(index)
-    shot = render_recipe(plan.scenes[plan.item(index).scene_index], recipe)
-    parts = encoded_parts(shot)
-    files = {}
+    return [write_sample(plan, target, index) for index in plan.items_of(unit)]
+
+
+def write_sample(plan: ExportPlan, target: Target, index: int) -> str:
+    """Render an item, write its files, and give its line of the manifest; see `write_unit`."""
+    entry, parts = rendered(plan, index)
     for part, path in plan.paths(index).items():
         data = parts[part]
-        _files.write_whole(out / path, data)
-        files[part] = {"path": path, "size": len(data), "sha256": _files.sha256_of(data)}
+        target.write_whole(path, data)
+        entry["files"][part] = {"path": path, "size": len(data), "sha256": _files.sha256_of(data)}
+    return json.dumps(entry, allow_nan=False)
+
+
+def rendered(plan: ExportPlan, index: int) -> tuple[dict[str, Any], Encoded]:
+    """An item's entry of the manifest, without files yet, and the bytes of its parts."""
+    recipe = plan.recipe(index)
+    shot = render_recipe(plan.scenes[plan.item(index).scene_index], recipe)
     entry = {
         "item": index,
         "recipe": recipe,
-        "files": files,
+        "files": {},
         "class_pixels": {} if shot.label is None else class_pixels(shot.label),
     }
-    return json.dumps(entry, allow_nan=False)
+    return entry, encoded_parts(shot, plan.parts)
 
 
 def class_pixels(label: NDArray[np.uint8]) -> dict[str, int]:

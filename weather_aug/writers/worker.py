@@ -1,4 +1,4 @@
-"""The worker process: renders the items it is given, and never outlives its parent."""
+"""The worker process: renders the units it is given, and never outlives its parent."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import signal
 import threading
 import traceback
 from multiprocessing.connection import Connection
-from pathlib import Path
 
 import cv2
 
 from weather_aug.writers.lock import working
 from weather_aug.writers.plan import ExportPlan
-from weather_aug.writers.sample import write_sample
+from weather_aug.writers.sample import write_unit
+from weather_aug.writers.target import Target
 
 READY, DONE, FAILED = "ready", "done", "failed"
 
 
-def work(plan: ExportPlan, out: Path, pipe: Connection) -> None:
-    """Answer item numbers from `pipe` with (DONE, line) until None comes.
+def work(plan: ExportPlan, target: Target, pipe: Connection) -> None:
+    """Answer unit numbers from `pipe` with (DONE, lines) until None comes.
 
     An error ends the worker; it goes to the parent as (FAILED, (error, traceback)).
     """
@@ -31,14 +31,14 @@ def work(plan: ExportPlan, out: Path, pipe: Connection) -> None:
     # One worker a core: threads of its own would only take the others' time.
     cv2.setNumThreads(1)
     try:
-        with working(out):
+        with working(target.state):
             parent = multiprocessing.parent_process()
             if parent is None or not parent.is_alive():
                 return
             plan.check_scenes()
             pipe.send((READY, None))
-            while (index := pipe.recv()) is not None:
-                pipe.send((DONE, write_sample(plan, out, index)))
+            while (unit := pipe.recv()) is not None:
+                pipe.send((DONE, write_unit(plan, target, unit)))
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return
     except MemoryError:

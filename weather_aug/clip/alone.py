@@ -7,22 +7,25 @@ and these make a label map for the same geometric prior that serves labelled pic
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug._checks import finite, image_uint8
-from weather_aug.clip.drivable import ground_edge
+from weather_aug.clip.drivable import edge_behind, ground_edge
 from weather_aug.clip.horizon import pitch_from_picture
 from weather_aug.clip.prior import geometric_prior_depth
 from weather_aug.clip.sky import sky_mask
-from weather_aug.taxonomy import BUILDING, ROAD, SKY
+from weather_aug.taxonomy import BUILDING, ROAD, SKY, TRAIN_ID
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 
 WORKING_WIDTH_PX = 320
+ABOVE_HORIZON_SHARE = 0.2
+CAR = TRAIN_ID["car"]
 
 
 def depth_from_picture(
@@ -66,15 +69,16 @@ def depth_from_picture(
 
 
 def surfaces(image: UInt8, *, horizon_px: float, focal_px: float, principal_x_px: float) -> UInt8:
-    """(H, W) train ids of a picture in three classes: road, sky, and building for what stands."""
+    """Train ids (H, W) of a picture that nobody labelled.
+
+    Four classes: road, sky, car for what is low and narrow, building for all else that stands.
+    """
     height, width = image.shape[:2]
     scale = min(1.0, WORKING_WIDTH_PX / width)
     size = max(1, round(width * scale)), max(1, round(height * scale))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    # Nothing below the horizon is sky, however bright.
-    sky = sky_mask(small)
     horizon = (horizon_px + 0.5) * scale - 0.5
-    sky[int(np.clip(np.floor(horizon) + 1, 0, size[1])) :] = False
+    sky = _open_sky(small, horizon)
     edge = ground_edge(
         small,
         sky,
@@ -82,7 +86,27 @@ def surfaces(image: UInt8, *, horizon_px: float, focal_px: float, principal_x_px
         focal_px=focal_px * scale,
         principal_x_px=(principal_x_px + 0.5) * scale - 0.5,
     )
-    grown = cv2.resize(edge.astype(np.float32)[None], (width, 1), interpolation=cv2.INTER_LINEAR)
-    ground = np.arange(height)[:, None] >= np.rint(grown / scale)
-    open_sky = cv2.resize(sky.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
-    return np.where(ground, ROAD, np.where(open_sky > 0.5, SKY, BUILDING)).astype(np.uint8)
+    behind = edge_behind(edge, horizon)
+    drop = edge - horizon
+    top = np.where(behind < edge, horizon - ABOVE_HORIZON_SHARE * drop, edge)
+    rows = np.arange(height)[:, None]
+    ground, low = (rows >= _rows_at(line, width, scale) for line in (edge, top))
+    high = cv2.resize(sky.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+    standing = np.where(low, CAR, np.where(high > 0.5, SKY, BUILDING))
+    return np.where(ground, ROAD, standing).astype(np.uint8)
+
+
+def _open_sky(image: UInt8, horizon_px: float) -> NDArray[np.bool_]:
+    """Sky above the horizon that hangs together: without labels, its holes may be windows."""
+    sky = sky_mask(image)
+    # Nothing below the horizon is sky, however bright.
+    sky[int(np.clip(np.floor(horizon_px) + 1, 0, len(sky))) :] = False
+    _, parts = cv2.connectedComponents(cv2.dilate(sky.astype(np.uint8), np.ones((3, 3), np.uint8)))
+    return np.isin(parts, np.unique(parts[:2][sky[:2]])) & sky
+
+
+def _rows_at(line: NDArray[Any], width: int, scale: float) -> Float32:
+    """A line of rows (w,) of the small picture at the columns of the whole one, (W,)."""
+    row = line.astype(np.float32)[None]
+    grown = cv2.resize(row, (width, 1), interpolation=cv2.INTER_LINEAR)[0]
+    return np.rint((grown + np.float32(0.5)) / np.float32(scale) - np.float32(0.5))

@@ -28,6 +28,9 @@ MOST_PLACE, MOST_COLOUR = 4.0, 2.0
 ROUNDS = 2
 LEVELS = 16
 STEP_COST, JUMP_COST = 1.0, 40.0
+NARROW_PX = (5, 9, 15, 25, 41, 67)
+NARROW_SHARE = 2.0
+LEAST_STEP_PX = 2
 
 
 def ground_edge(
@@ -72,6 +75,28 @@ def ground_edge(
         found = np.arange(height)[:, None] >= edge
         share = np.where(np.arange(height)[:, None] >= top, 0.5 * (share + found), 0)
     return edge.astype(np.int32)
+
+
+def edge_behind(edge: Int32, horizon_px: float) -> Int32:
+    """The same edge without narrow things in front of it, (W,): where a facade meets the ground.
+
+    Something three metres wide that meets the ground at a depth z reaches f * 3 / z pixels across
+    and f * h / z below the horizon, so that it is about twice as wide as it is low.
+
+    Args:
+        edge: (W,) of `ground_edge`.
+        horizon_px: Row of the horizon.
+    """
+    behind = edge.copy()
+    signal = edge.astype(np.float32)[None]
+    for side in NARROW_PX:
+        if side >= len(edge):
+            break
+        opened = cv2.morphologyEx(signal, cv2.MORPH_OPEN, np.ones((1, side), np.uint8))[0]
+        low = edge - horizon_px >= side / NARROW_SHARE
+        taken = low & (edge - opened >= LEAST_STEP_PX)
+        behind = np.where(taken, np.minimum(behind, opened.astype(np.int32)), behind)
+    return behind
 
 
 def _words(image: NDArray[np.uint8]) -> tuple[Int32, Int32]:

@@ -96,6 +96,7 @@ def test_the_same_seed_gives_the_same_sequence(sample: Sample, make: Make) -> No
 
 @pytest.mark.parametrize("given", ["depth", "no depth"])
 @pytest.mark.parametrize("of", [IGNORE, SKY])
+@pytest.mark.filterwarnings("ignore::weather_aug.clip.depth_sources.GuessedDepthWarning")
 @EACH
 def test_masks_of_nothing(sample: Sample, make: Make, of: int, given: str) -> None:
     """All ignored, or all sky."""
@@ -105,6 +106,13 @@ def test_masks_of_nothing(sample: Sample, make: Make, of: int, given: str) -> No
     done = A.Compose([make(p=1.0)])(**sample)
     assert done["image"].shape == sample["image"].shape
     assert set(np.unique(done["mask"])) <= {of, IGNORE}
+
+
+@pytest.mark.filterwarnings("ignore::weather_aug.clip.depth_sources.GuessedDepthWarning")
+def test_a_picture_alone_is_enough(sample: Sample) -> None:
+    done = A.Compose([RandomFog(p=1.0)])(image=sample["image"], sample_key=1)
+    assert (done["image"] != sample["image"]).any()
+    assert "mask" not in done
 
 
 def test_empty_lists_of_masks_pass_through(sample: Sample) -> None:

@@ -58,7 +58,7 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def found(python: Path, tiny_scene: WeatherScene, tmp_path_factory: Any) -> dict[str, Any]:
     script = Path(__file__).with_name("albumentations_x.py")
     cwd = tmp_path_factory.mktemp("elsewhere")
-    done = run(python, script, tiny_scene.path.resolve(), timeout=600, cwd=cwd)
+    done = run(python, script, tiny_scene.path.resolve(), timeout=1200, cwd=cwd)
     assert done.returncode == 0, done.stderr[-3000:]
     return json.loads(done.stdout)
 

@@ -44,12 +44,8 @@ def unit_range(images: Tensor) -> Tensor:
 
 
 def picture(image: Tensor) -> NDArray[np.float32]:
-    """(H, W, 3) float32 in [0, 1] of a (3, H, W) tensor of any type and device.
-
-    Raises:
-        ArgumentError: If it leaves [0, 1].
-    """
-    return np.ascontiguousarray(unit_range(image.detach()).permute(1, 2, 0).float().cpu().numpy())
+    """(H, W, 3) float32 of a (3, H, W) tensor of any type and device."""
+    return np.ascontiguousarray(image.detach().permute(1, 2, 0).float().cpu().numpy())
 
 
 def planes(

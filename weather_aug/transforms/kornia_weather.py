@@ -244,7 +244,7 @@ class RandomWeather(K.IntensityAugmentationBase2D):
             if depths is None and not bool(params["depth"][row, 0, 0, 0].isnan()):
                 continue
             frame = self.weathering.frame(
-                picture(images[row]),
+                picture(unit_range(images[row])),
                 drawn_of(params, row),
                 mask=label,
                 depth=None if depths is None else metres(depths[row]),

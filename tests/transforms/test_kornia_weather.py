@@ -31,7 +31,7 @@ from kornia_street import (
 from torch import Tensor, nn
 
 from weather_aug.clip.depth_sources import DepthSource
-from weather_aug.errors import ArgumentError, DataError
+from weather_aug.errors import ArgumentError, DataError, MissingExtraError
 from weather_aug.render.batch import BATCH_OPTIONS
 from weather_aug.render.options import DEFAULT_OPTIONS
 from weather_aug.scene.policy import WeatherPolicy
@@ -492,6 +492,14 @@ def test_without_kornia_the_error_names_the_extra() -> None:
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert "pip install 'weather-aug[kornia]'" in run.stdout, run.stderr
+
+
+def test_an_old_kornia_is_refused() -> None:
+    """With 0.8.3 masks would not be marked."""
+    with pytest.raises(MissingExtraError, match=r"0\.8\.3 is installed"):
+        kornia_weather.check_version("0.8.3")
+    for version in ("0.9.0", "0.10.1rc1", "1.0.0"):
+        kornia_weather.check_version(version)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")

@@ -15,7 +15,7 @@ from weather_aug._checks import finite
 from weather_aug._extras import require
 from weather_aug._keys import uniforms
 from weather_aug.clip.types import Camera, Frame, FrameKey
-from weather_aug.errors import ArgumentError
+from weather_aug.errors import ArgumentError, MissingExtraError
 from weather_aug.render.batch import RenderedBatch, render_batch
 from weather_aug.render.batch_checks import BATCH_OPTIONS, check_options, one_each
 from weather_aug.scene.policy import WeatherPolicy
@@ -49,7 +49,24 @@ from weather_aug.transforms.picture import (
 # Without it the import below would fail with no word on which extra to install.
 require("kornia", extra="kornia", to="use RandomWeather on batches")
 
+import kornia  # noqa: E402
 import kornia.augmentation as K  # noqa: E402
+
+
+def check_version(version: str) -> None:
+    """Refuse a kornia that copies parameters on their way to a transform.
+
+    Raises:
+        MissingExtraError: If it is older than 0.9.
+    """
+    if tuple(int(part) for part in version.split(".")[:2]) < (0, 9):
+        raise MissingExtraError(
+            f"kornia 0.9 is needed to use RandomWeather on batches, and {version} is installed; "
+            "install it with: pip install 'weather-aug[kornia]'"
+        )
+
+
+check_version(kornia.__version__)
 
 
 class RandomWeather(K.IntensityAugmentationBase2D):
@@ -327,8 +344,15 @@ class RandomWeather(K.IntensityAugmentationBase2D):
 
     def _rows(self, params: Params) -> list[int]:
         """Which pictures change: those that the gate lets through, unless their day is clear."""
-        through = self._gate(params).nonzero().flatten().tolist()
-        return [row for row in through if not drawn_of(params, row).weather.is_clear]
+        # With p = 1 kornia does not ask its gate, neither for pictures nor for masks.
+        through = (
+            (params["batch_prob"] > 0.5).tolist() if self.p < 1 else [True] * len(params["seed"])
+        )
+        return [
+            row
+            for row, applied in enumerate(through)
+            if applied and not drawn_of(params, row).weather.is_clear
+        ]
 
     def _marked(self, mask: Tensor, hidden: Tensor) -> Tensor:
         return marked(mask, hidden, self.weathering.ids.ignore_index)

@@ -108,7 +108,7 @@ def test_every_kind_of_picture_gets_the_same_weather(image: Any, mask: Any) -> N
     assert isinstance(pil, PIL.Image.Image)
     assert (np.asarray(pil).transpose(2, 0, 1) == expected.numpy()).all()
 
-    video = weather(tv_tensors.Video(image[None]), mask[None], NAME)[0]
+    video = weather(tv_tensors.Video(image[None]), tv_tensors.Mask(mask[None]), NAME)[0]
     assert type(video) is tv_tensors.Video
     assert torch.equal(video[0], expected)
 
@@ -141,8 +141,7 @@ def test_the_layout_does_not_matter(image: Any, mask: Any, dtype: torch.dtype) -
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 1), (33, 17)])
 @pytest.mark.parametrize("policy", [SNOW, FOG])
 def test_odd_sizes(image: Any, mask: Any, size: tuple[int, int], policy: WeatherPolicy) -> None:
-    rows, columns = size
-    done, marked = always(policy)(image[..., :rows, :columns], mask[..., :rows, :columns])
+    done, marked = always(policy)(*v2.CenterCrop(size)(image, mask))
     assert (done.shape, marked.shape) == ((3, *size), size)
 
 
@@ -488,7 +487,8 @@ def test_a_batch_shares_one_draw(image: Any, mask: Any, depth: Any) -> None:
         alone = always(FOG)(picture, mask, Depth(depths[number]), NAME)
         assert torch.equal(done[number], alone[0])
         assert torch.equal(marked[number], alone[1])
-    plain = always(FOG)(batch.as_subclass(torch.Tensor), masks[:, None], depths[:, None], NAME)
+    wide = tv_tensors.Mask(masks[:, None]), Depth(depths[:, None])
+    plain = always(FOG)(batch.as_subclass(torch.Tensor), *wide, NAME)
     assert torch.equal(plain[0], done)
 
 
@@ -546,7 +546,7 @@ def test_a_scene_gives_the_full_effect(tiny_scene: Any) -> None:
     frame = tiny_scene.frame(tiny_scene.keys[3])
     image = image_of(frame)
     mask = tv_tensors.Mask(torch.from_numpy(frame.label + 0))
-    weather = always(scenes=[tiny_scene.folder])
+    weather = always(scenes=[tiny_scene.path])
     done, marked, *_ = weather(image, mask, SceneKey(frame.key), NAME)
     drawn = weather.weathering.draw(weather.draws.key(frame.image, NAME.name))
     shot = tiny_scene.render(frame.key, drawn.weather, seed=drawn.seed)
@@ -575,6 +575,12 @@ REFUSED: dict[str, tuple[Callable[[Any, Any], Any], str]] = {
     "a PIL mask": (
         lambda i, m: (i, PIL.Image.fromarray(m.numpy())),
         "wrap masks as tv_tensors.Mask",
+    ),
+    "a plain mask": (lambda i, m: (i, m[:] + 0), "looks like a mask"),
+    "two plain tensors": (lambda i, m: (i[:] + 0, m[None] + 0), r"\(1, 48, 64\) looks like a mask"),
+    "an array for a mask": (
+        lambda i, m: (v2.functional.to_pil_image(i), m.numpy()),
+        "looks like a mask",
     ),
     "two masks": (lambda i, m: (i, m, m), "one mask, got 2: wrap depth as Depth"),
     "two depths": (lambda i, m: (i, Depth(m.float()), Depth(m.float())), "one depth, got 2"),

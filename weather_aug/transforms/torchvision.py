@@ -18,7 +18,7 @@ from weather_aug.clip.types import Camera
 from weather_aug.errors import ArgumentError, MissingExtraError, printable
 from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.transforms.draws import Draws, sample_fields
-from weather_aug.transforms.picture import Drawn, Weathered, Weathering
+from weather_aug.transforms.picture import Drawn, Weathered, Weathering, rgb_uint8
 from weather_aug.transforms.shelf import Shelf
 
 try:
@@ -81,10 +81,11 @@ class RandomWeather(v2.Transform):
         the CPU, without gradients. Boxes, key points, `Unmarked` masks and everything else are
         handed on as they are.
 
-        As everywhere in v2, a batch (..., 3, H, W) shares one draw, and a plain tensor beside an
-        `Image` is not looked at: wrap masks. A `tv_tensors.Video` (..., T, 3, H, W) is a drive: the
-        same drops fly on, under one light. Masks and depth then have the same leading axes, and
-        there is one `Camera` or `SceneKey` for each picture, in order.
+        As everywhere in v2, a batch (..., 3, H, W) shares one draw, and plain tensors beside the
+        picture are handed on; one that looks like a mask is refused where no mask is wrapped. A
+        `tv_tensors.Video` (..., T, 3, H, W) is a drive: the same drops fly on, under one light.
+        Masks and depth of many pictures have the same leading axes, and there is one `Camera` or
+        `SceneKey` for each picture, in order.
 
         Put the transform before crops, flips and colours: depth, camera and scene belong to the
         whole picture as it was taken. No default collation knows `Camera` and the keys: leave them
@@ -131,6 +132,20 @@ class RandomWeather(v2.Transform):
     def set_epoch(self, epoch: int) -> None:
         """Draw the weather of another epoch, in this process and in all workers."""
         self.draws.set_epoch(epoch)
+
+    def check_inputs(self, flat_inputs: list[Any]) -> None:
+        """Refuse what looks like a label mask, and which v2 hands on as it is."""
+        pictures = [each for each in flat_inputs if _is_picture(each)]
+        # As v2 does: a plain tensor is a picture where nothing else is one, and the first alone.
+        picture = ([each for each in pictures if not _is_plain(each)] or pictures or [None])[0]
+        if picture is None or any(_is_label(each) for each in flat_inputs):
+            return
+        for each in flat_inputs:
+            if each is not picture and _is_unwrapped_mask(each, _size(picture)):
+                raise ArgumentError(
+                    f"a plain array of shape {tuple(each.shape)} looks like a mask and would come "
+                    "back unmarked: wrap it as tv_tensors.Mask, or as Unmarked if it is no label"
+                )
 
     def make_params(self, flat_inputs: list[Any]) -> dict[str, Any]:
         """The weathered picture and mask, None where the draw leaves the sample as it is."""
@@ -186,7 +201,7 @@ class _Sample:
     mask: torch.Tensor | None
     """As given."""
     pixels: NDArray[Any]
-    """(N, H, W, 3), all pictures."""
+    """(N, H, W, 3) uint8, all pictures."""
     num_together: int
     """How many pictures in a row are of one drive."""
     known: dict[str, list[Any] | None]
@@ -207,7 +222,9 @@ class _Sample:
             "picture", pictures, "call RandomWeather for each, and wrap masks as tv_tensors.Mask"
         )
         labels = [each for each in flat_inputs if _is_label(each)]
-        mask = _at_most_one("mask", labels, "wrap depth as Depth, what else is no label as Unmarked")
+        mask = _at_most_one(
+            "mask", labels, "wrap depth as Depth, what else is no label as Unmarked"
+        )
         depths = [each for each in flat_inputs if isinstance(each, Depth)]
         depth = _at_most_one("depth", depths, "give that of the picture")
         names = [each.name for each in flat_inputs if isinstance(each, SampleKey)]
@@ -232,14 +249,30 @@ class _Sample:
         )
 
 
-def _is_picture(inpt: Any) -> bool:
-    if isinstance(inpt, tv_tensors.Image | tv_tensors.Video | PIL.Image.Image):
-        return True
+def _is_plain(inpt: Any) -> bool:
     return isinstance(inpt, torch.Tensor) and not isinstance(inpt, tv_tensors.TVTensor)
+
+
+def _is_picture(inpt: Any) -> bool:
+    wrapped = tv_tensors.Image | tv_tensors.Video | PIL.Image.Image
+    return isinstance(inpt, wrapped) or _is_plain(inpt)
 
 
 def _is_label(inpt: Any) -> bool:
     return isinstance(inpt, tv_tensors.Mask) and not isinstance(inpt, Unmarked)
+
+
+def _is_unwrapped_mask(inpt: Any, size: tuple[int, ...]) -> bool:
+    if isinstance(inpt, np.ndarray):
+        return inpt.shape[-2:] == size and inpt.dtype.kind in "iu"
+    return _is_plain(inpt) and inpt.shape[-2:] == size and not inpt.is_floating_point()
+
+
+def _size(picture: Any) -> tuple[int, ...]:
+    """(H, W)."""
+    if isinstance(picture, PIL.Image.Image):
+        return picture.height, picture.width
+    return tuple(picture.shape[-2:])
 
 
 def _at_most_one(kind: str, found: list[Any], cure: str) -> Any:
@@ -257,7 +290,7 @@ def _one_each(kind: str, found: list[Any], count: int) -> list[Any] | None:
 
 
 def _pixels(picture: Any) -> tuple[NDArray[Any], tuple[int, ...]]:
-    """(N, H, W, 3) pixels of a picture or of many, and the axes that lead to them."""
+    """(N, H, W, 3) uint8 pixels of a picture or of many, and the axes that lead to them."""
     if isinstance(picture, PIL.Image.Image):
         if picture.mode != "RGB":
             raise ArgumentError(
@@ -274,9 +307,10 @@ def _pixels(picture: Any) -> tuple[NDArray[Any], tuple[int, ...]]:
             "image must not require a gradient, which this RandomWeather cannot give: detach it, "
             "or use weather_aug.transforms.kornia"
         )
-    height, width = picture.shape[-2:]
-    pixels = picture.detach().cpu().movedim(-3, -1).reshape(-1, height, width, 3)
-    return pixels.numpy(), tuple(picture.shape[:-3])
+    pixels = picture.detach().cpu().movedim(-3, -1).reshape(-1, *_size(picture), 3).numpy()
+    if picture.dtype == torch.float32:
+        pixels = np.stack([rgb_uint8(each) for each in pixels])
+    return pixels, tuple(picture.shape[:-3])
 
 
 def _planes(name: str, given: torch.Tensor, size: tuple[int, ...]) -> list[NDArray[Any]]:
@@ -298,17 +332,18 @@ def _picture_like(given: Any, images: list[NDArray[Any]]) -> Any:
     if isinstance(given, PIL.Image.Image):
         return PIL.Image.fromarray(images[0])
     height, width, _ = images[0].shape
-    done = np.empty((len(images), 3, height, width), images[0].dtype)
+    done = np.empty((len(images), 3, height, width), np.uint8)
     for place, image in zip(done, images, strict=True):
         place[...] = image.transpose(2, 0, 1)
-    return _like(given, done)
+    # torchvision's own steps between 8 bits and [0, 1], which differ from others in the last bit.
+    scaled = v2.functional.to_dtype(torch.from_numpy(done), given.dtype, scale=True)
+    return _like(given, scaled)
 
 
 def _mask_like(given: torch.Tensor | None, masks: list[Any]) -> torch.Tensor | None:
-    return None if given is None else _like(given, np.stack(masks))
+    return None if given is None else _like(given, torch.from_numpy(np.stack(masks)))
 
 
-def _like(given: torch.Tensor, done: NDArray[Any]) -> torch.Tensor:
+def _like(given: torch.Tensor, done: torch.Tensor) -> torch.Tensor:
     """A tensor of the shape, device and class of the given one."""
-    tensor = torch.from_numpy(done).reshape(given.shape).to(given.device)
-    return tv_tensors.wrap(tensor, like=given)
+    return tv_tensors.wrap(done.reshape(given.shape).to(given.device), like=given)

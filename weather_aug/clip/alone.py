@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from weather_aug._checks import finite, image_uint8
 from weather_aug.clip.completion import completed
 from weather_aug.clip.drivable import edge_behind, ground_edge
-from weather_aug.clip.horizon import pitch_from_picture
+from weather_aug.clip.horizon import pitch_from_picture, shrunk
 from weather_aug.clip.prior import MAX_DEPTH_M, MIN_DEPTH_M, geometric_prior_depth
 from weather_aug.clip.sky import sky_mask
 from weather_aug.taxonomy import BUILDING, ROAD, SKY, TRAIN_ID
@@ -24,7 +24,6 @@ from weather_aug.taxonomy import BUILDING, ROAD, SKY, TRAIN_ID
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 
-WORKING_WIDTH_PX = 320
 ABOVE_HORIZON_SHARE = 0.2
 GROUND_CONFIDENCE, FOOT_CONFIDENCE, FACADE_CONFIDENCE = 100.0, 1.0, 3e-3
 FOOT_ROWS = 3
@@ -128,10 +127,7 @@ class _Parted(NamedTuple):
 def _parted(image: UInt8, focal_px: float, principal_px: tuple[float, float]) -> _Parted:
     focal_px = finite("focal_px", focal_px, 1e-3)
     x, y = (finite(f"principal_px[{i}]", principal_px[i], -1e6, 1e6) for i in range(2))
-    height, width = image.shape[:2]
-    scale = min(1.0, WORKING_WIDTH_PX / width)
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    small, scale = shrunk(image)
     # Pixel centres sit at integers, so the picture starts half a pixel before 0.
     x, y, focal_px = (x + 0.5) * scale - 0.5, (y + 0.5) * scale - 0.5, focal_px * scale
     pitch_rad = pitch_from_picture(small, focal_px=focal_px, principal_px=(x, y))
@@ -140,7 +136,7 @@ def _parted(image: UInt8, focal_px: float, principal_px: tuple[float, float]) ->
     edge = ground_edge(small, sky, horizon_px=horizon_px, focal_px=focal_px, principal_x_px=x)
     behind = edge_behind(edge, horizon_px)
     top = np.where(behind < edge, horizon_px - ABOVE_HORIZON_SHARE * (edge - horizon_px), edge)
-    rows = np.arange(size[1])[:, None]
+    rows = np.arange(len(small))[:, None]
     standing = np.where(rows >= np.rint(top), CAR, np.where(sky, SKY, BUILDING))
     label = np.where(rows >= edge, ROAD, standing).astype(np.uint8)
     return _Parted(small, label, scale, (x, y), pitch_rad)

@@ -306,9 +306,10 @@ def test_any_structure_comes_back(image: Any, mask: Any) -> None:
             assert out is wanted or torch.equal(out, wanted)
 
 
-def test_one_picture_alone(depth: Any, image: Any) -> None:
-    done = v2.Compose([always(), v2.ToDtype(torch.float32, scale=True)])([image, depth])
-    assert done[0].dtype == torch.float32
+@pytest.mark.filterwarnings("ignore:depth is guessed")
+def test_one_picture_alone(image: Any) -> None:
+    done = v2.Compose([always(), v2.ToDtype(torch.float32, scale=True)])(image)
+    assert (type(done), done.dtype) == (tv_tensors.Image, torch.float32)
 
 
 # Draws
@@ -438,7 +439,8 @@ def test_the_number_of_workers_does_not_matter(image: Any) -> None:
     alone = epoch_of(loader_of(streets, 0, batch_size=1))
     assert alone == epoch_of(loader_of(streets, 2, batch_size=1))
     assert alone == epoch_of(loader_of(streets, 2, batch_size=3))
-    assert len(set(alone)) > 4
+    assert len(set(alone)) > 2
+    assert alone != epoch_of(loader_of(Streets(pipeline, named=False), 2, batch_size=1))
 
 
 @forks

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from weather_aug._checks import finite
-from weather_aug._keys import uniforms
+from weather_aug._keys import key_of, uniforms
 from weather_aug.clip.types import Camera
 from weather_aug.errors import ArgumentError, MissingExtraError, printable
 from weather_aug.scene.policy import WeatherPolicy
@@ -151,8 +151,7 @@ class RandomWeather(v2.Transform):
         """The weathered picture and mask, None where the draw leaves the sample as it is."""
         sample = _Sample.of(flat_inputs)
         key = self.draws.key(sample.pixels, sample.name)
-        # The first number of this key is the speed's.
-        if uniforms(key, 2)[1] >= self.p:
+        if uniforms(key_of("torchvision-p", key % 2**64), 1)[0] >= self.p:
             return {"picture": None, "mask": None}
         done = self._weathered(sample, self.weathering.draw(key))
         return {

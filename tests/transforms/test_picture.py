@@ -38,6 +38,9 @@ def test_a_float_picture_is_the_same_in_eight_bits(frame: Frame) -> None:
     done = SNOW.render(fine, drawn, mask=frame.label, depth=frame.depth_m)
     assert done.image.dtype == np.float32
     assert (np.rint(done.image * 255) == whole.image).all()
+    between = fine + np.float32(0.4 / 255)
+    done = SNOW.render(between.clip(0, 1), drawn, mask=frame.label, depth=frame.depth_m)
+    assert (np.rint(done.image * 255) == whole.image).all()
     assert done.mask is not None
     assert (done.mask == whole.mask).all()
 
@@ -71,8 +74,16 @@ def test_clear_weather_is_the_picture_itself(frame: Frame) -> None:
     done = CLEAR.render(frame.image, CLEAR.draw(1), mask=frame.label, depth=frame.depth_m)
     assert (done.image == frame.image).all()
     assert (done.mask == frame.label).all()
-    fine = (frame.image / np.float32(255)).astype(np.float32)
+    fine = (frame.image / np.float32(255.7)).astype(np.float32)
     assert (CLEAR.render(fine, CLEAR.draw(1), mask=frame.label).image == fine).all()
+
+
+@pytest.mark.parametrize("taxonomy", ["train_ids", None])
+def test_labels_that_are_kept_are_kept(frame: Frame, taxonomy: str | None) -> None:
+    keep = Weathering.of(FOG.policy, options=RenderOptions(labels="keep"), taxonomy=taxonomy)
+    done = keep.render(frame.image, keep.draw(1), mask=frame.label, depth=frame.depth_m)
+    assert (done.mask == frame.label).all()
+    assert done.shot.invalid.any()
 
 
 def test_a_prior_takes_the_place_of_missing_depth(frame: Frame) -> None:

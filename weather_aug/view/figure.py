@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from weather_aug._checks import finite
 from weather_aug._extras import require
+from weather_aug._keys import check_seed
 from weather_aug.air import Air
 from weather_aug.clip.types import FrameKey
 from weather_aug.errors import ArgumentError, printable
@@ -23,7 +24,7 @@ from weather_aug.render.compose import RenderedFrame
 from weather_aug.scene.policy import WeatherPolicy, weather_of
 from weather_aug.view.planes import PLANES, painted
 from weather_aug.view.source import Source
-from weather_aug.view.units import in_units
+from weather_aug.view.units import in_units, titled
 from weather_aug.weather import Weather
 
 # Without it the import below would fail with no word on which extra to install.
@@ -102,12 +103,12 @@ def draws(
 ) -> Sheet:
     """What a policy draws; see `weather_aug.preview.draws`."""
     _check(planes, tile_width)
-    count = int(finite("count", count, 1, MOST_DRAWS))
-    columns = int(finite("columns", columns, 1, MOST_DRAWS))
+    finite("count", check_seed("count", count), 1, MOST_DRAWS)
+    finite("columns", check_seed("columns", columns), 1, MOST_DRAWS)
     titles, shots = [], []
     for epoch, index in items(len(source.keys), count):
         drawn = policy.draw(seed, epoch, index)
-        titles.append(f"{drawn.kind}: {in_units(drawn.weather)}".removeprefix("clear: "))
+        titles.append(titled(drawn.kind, drawn.weather))
         shots.append(source.shot(source.keys[index], drawn.weather, drawn.seed))
     rows = []
     for first in range(0, count, columns):
@@ -186,7 +187,7 @@ def _font_pt(texts: Sequence[str], room_px: int) -> float:
 
 
 def _check(planes: Sequence[str], tile_width: int) -> None:
-    finite("tile_width", tile_width, *TILE_WIDTH_PX)
+    finite("tile_width", check_seed("tile_width", tile_width), *TILE_WIDTH_PX)
     unknown = [plane for plane in planes if plane not in PLANES]
     if unknown or isinstance(planes, str) or not planes:
         raise ArgumentError(

@@ -16,6 +16,7 @@ import numpy as np
 
 from weather_aug._checks import finite
 from weather_aug._extras import require
+from weather_aug._keys import check_seed
 from weather_aug._png import png_bytes
 from weather_aug.clip.types import FrameKey
 from weather_aug.errors import ArgumentError, WeatherAugError, printable
@@ -24,7 +25,7 @@ from weather_aug.scene.policy import TYPES, weather_of
 from weather_aug.severity import parse_severity
 from weather_aug.view.planes import PLANES, painted
 from weather_aug.view.source import Source
-from weather_aug.view.units import in_units
+from weather_aug.view.units import titled
 from weather_aug.weather import Weather
 
 WIDEST_PX = (64, 4096)
@@ -38,8 +39,8 @@ def open_panel(
     if kind not in TYPES:
         raise ArgumentError(f"weather type {printable(kind)!r} is not one of {', '.join(TYPES)}")
     start = parse_severity(severity)
-    seed = int(finite("seed", seed, 0, MOST_SEED))
-    max_width = int(finite("max_width", max_width, *WIDEST_PX))
+    finite("seed", check_seed("seed", seed), 0, MOST_SEED)
+    finite("max_width", check_seed("max_width", max_width), *WIDEST_PX)
     return Panel(source, _controls(source, kind, start, seed), max_width)
 
 
@@ -92,7 +93,9 @@ class Panel:
         self.shot = shot
         self.picture.value = png
         self.picture.layout.display = None
-        self.caption.value = _as_html(_told(shot, self.weather))
+        self.caption.value = _as_html(
+            _told(shot, titled(self.controls["type"].value, self.weather))
+        )
 
     def say(self, error: WeatherAugError) -> None:
         """Show an error's words, and no picture that could be taken for what was asked."""
@@ -164,8 +167,8 @@ def _rows(controls: dict[str, Any]) -> list[Any]:
     ]
 
 
-def _told(shot: RenderedFrame, weather: Weather) -> str:
-    told = f"{in_units(weather)} · frame {shot.frame.key}"
+def _told(shot: RenderedFrame, weather: str) -> str:
+    told = f"{weather} · frame {shot.frame.key}"
     if shot.label is None:
         return told
     hidden = float(np.mean(shot.label != shot.label_full))

@@ -25,6 +25,8 @@ def in_units(weather: Weather) -> str:
         told.append(f"{_short(weather.snow_mm_per_h)} mm/h of water")
     if weather.visibility_m < math.inf:
         told.append(f"visibility {_short(weather.visibility_m)} m")
+    if not told and max(weather.mist_per_km, weather.spray_per_km) > 0:
+        told.append("mist")
     if told:
         return ", ".join(told)
     if max(weather.snow_cover, weather.road_snow_cover) > 0:
@@ -32,6 +34,11 @@ def in_units(weather: Weather) -> str:
     if max(weather.wetness, weather.puddles) > 0:
         return "wet ground"
     return "clear" if weather.is_clear else "clear air"
+
+
+def titled(kind: str, weather: Weather) -> str:
+    """A type's name and what it is in units: "rain: 20 mm/h", or "clear" alone."""
+    return kind if kind == "clear" else f"{kind}: {in_units(weather)}"
 
 
 def _short(number: float) -> str:

@@ -79,15 +79,17 @@ def sweep(
     """Rows of weathers, columns of severities; see `weather_aug.preview.sweep`."""
     _check(planes, tile_width)
     key = key or source.keys[len(source.keys) // 2]
-    clear = source.shot(key, Weather.clear(), seed)
+    clear = _tiles(source.shot(key, Weather.clear(), seed), planes, tile_width)
     rows = []
     for kind in kinds:
-        weathers = [weather_of(kind, severity) for severity in severities]
-        # The air has drifted alike in all, so that drops stay where they are.
-        shots = [clear, *(source.shot(key, w, seed, Air.held(w)) for w in weathers)]
-        names = zip(severities, weathers, strict=True)
-        titles = ["clear", *(f"{severity}: {in_units(w)}" for severity, w in names)]
-        rows += _rows(kind, titles, shots, planes, tile_width)
+        titles, columns = ["clear"], [clear]
+        for severity in severities:
+            weather = weather_of(kind, severity)
+            # The air has drifted alike in all, so that drops stay where they are.
+            shot = source.shot(key, weather, seed, Air.held(weather))
+            titles.append(f"{severity}: {in_units(weather)}")
+            columns.append(_tiles(shot, planes, tile_width))
+        rows += _rows(kind, titles, columns, planes)
     return laid_out(rows, tile_width)
 
 
@@ -105,15 +107,16 @@ def draws(
     _check(planes, tile_width)
     finite("count", check_seed("count", count), 1, MOST_DRAWS)
     finite("columns", check_seed("columns", columns), 1, MOST_DRAWS)
-    titles, shots = [], []
+    titles, tiles = [], []
     for epoch, index in items(len(source.keys), count):
         drawn = policy.draw(seed, epoch, index)
         titles.append(titled(drawn.kind, drawn.weather))
-        shots.append(source.shot(source.keys[index], drawn.weather, drawn.seed))
+        shot = source.shot(source.keys[index], drawn.weather, drawn.seed)
+        tiles.append(_tiles(shot, planes, tile_width))
     rows = []
     for first in range(0, count, columns):
         part = slice(first, first + columns)
-        rows += _rows("", titles[part], shots[part], planes, tile_width)
+        rows += _rows("", titles[part], tiles[part], planes)
     return laid_out(rows, tile_width)
 
 
@@ -161,19 +164,18 @@ def laid_out(rows: Sequence[Row], tile_width: int) -> Sheet:
     return figure
 
 
+def _tiles(shot: RenderedFrame, planes: Sequence[str], tile_width: int) -> list[UInt8]:
+    """The planes of a shot, small: a sheet holds many shots, and a shot is large."""
+    return [painted(shot, plane, tile_width) for plane in planes]
+
+
 def _rows(
-    name: str,
-    titles: Sequence[str],
-    shots: Sequence[RenderedFrame],
-    planes: Sequence[str],
-    tile_width: int,
+    name: str, titles: Sequence[str], columns: Sequence[Sequence[UInt8]], planes: Sequence[str]
 ) -> list[Row]:
-    """The planes of some shots below each other, under one row of titles."""
-    rows: list[Row] = []
-    for plane in planes:
-        pictures = [painted(shot, plane, tile_width) for shot in shots]
-        rows.append(Row(plane, (), pictures) if rows else Row(name, titles, pictures))
-    return rows
+    """The planes of some columns below each other, under one row of titles."""
+    first, *others = (list(row) for row in zip(*columns, strict=True))
+    below = [Row(plane, (), row) for plane, row in zip(planes[1:], others, strict=True)]
+    return [Row(name, titles, first), *below]
 
 
 def _height(picture: UInt8, width: int) -> int:

@@ -173,6 +173,16 @@ def test_a_single_picture_is_weathered_as_the_transforms_do(tiny_scene: WeatherS
     assert (shown(as_float)[1] == fog).all()
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_picture_alone_is_enough(tiny_scene: WeatherScene) -> None:
+    image = np.array(tiny_scene.frame(tiny_scene.keys[0]).image)
+    clear, fog = shown(preview.sweep(image, **FOG))
+    assert (clear == image).all()
+    assert (fog != image).any()
+    with pytest.raises(ArgumentError, match="no label to show"):
+        preview.draws(image)
+
+
 def test_depth_and_the_masks_ids_are_the_callers(tiny_scene: WeatherScene) -> None:
     frame = tiny_scene.frame(tiny_scene.keys[0])
     image, mask = np.array(frame.image), np.array(frame.label)

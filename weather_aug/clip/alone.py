@@ -79,7 +79,7 @@ def depth_from_picture(
     sky = parted.label == SKY
     # In inverse depth the ground is linear, and a membrane over it stays flat.
     inverse = completed(
-        1 / prior, _confidence(parted.label), parted.image, barrier=sky, sweeps=SWEEPS
+        np.reciprocal(prior), _confidence(parted.label), parted.image, barrier=sky, sweeps=SWEEPS
     )
     height, width = image.shape[:2]
     grown = cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR)

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tiny_clip import TinyClip
 
-from weather_aug.clip import alone, drivable, horizon
+from weather_aug.clip import alone, horizon
 from weather_aug.clip.alone import depth_from_picture, surfaces_of
 from weather_aug.clip.drivable import edge_behind, ground_edge
 from weather_aug.clip.horizon import pitch_from_picture
@@ -153,6 +153,22 @@ def test_street_photographs_are_parted_as_people_part_them() -> None:
     assert np.mean(grounds) > 0.85
 
 
+def _sky_border_missed() -> int:
+    """Pixels on the wrong side of a border of teeth that are finer than the copy worked on."""
+    image = np.full((540, 960, 3), (150, 182, 226), np.uint8)
+    skyline = 200 + 3 * (np.arange(960) // 4 % 2)
+    land = np.arange(540)[:, None] >= skyline
+    image[land] = (60, 70, 50)
+    found = depth_from_picture(image, focal_px=830.0, principal_px=(479.5, 269.5))
+    return int(np.count_nonzero(np.isfinite(found) != land))
+
+
+def test_the_border_of_the_sky_is_the_pictures_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert _sky_border_missed() < 20
+    monkeypatch.setattr(alone, "_parted_by_colour", lambda image, share, *_: share > 0.5)
+    assert _sky_border_missed() > 500
+
+
 def test_narrow_things_stand_before_what_is_behind() -> None:
     edge = np.full(320, 130, np.int32)
     edge[100:130] = 160
@@ -232,4 +248,3 @@ def test_the_copy_that_is_worked_on_is_bounded() -> None:
         small, _ = horizon.shrunk(np.zeros((*shape, 3), np.uint8))
         assert small.shape[0] <= horizon.TALLEST_PX
         assert small.shape[1] <= horizon.WIDEST_PX
-    assert drivable.ROUNDS > 0

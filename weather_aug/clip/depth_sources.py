@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from weather_aug.clip.alone import depth_from_picture
 from weather_aug.clip.prior import geometric_prior_depth
 from weather_aug.clip.types import Camera
+from weather_aug.taxonomy import IGNORE
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 DepthOf = Callable[[UInt8], Float32]
 """(H, W, 3) uint8 RGB → (H, W) float32 z-depth in metres."""
+
+_warned = False
+
+
+class GuessedDepthWarning(UserWarning):
+    """Depth was guessed from pictures alone; said once in a process."""
 
 
 @dataclass(frozen=True)
@@ -42,10 +51,36 @@ class DepthSource:
             camera: Of the picture's size.
             camera_height_m: Height of the camera over the ground, metres.
         """
-        assert label is not None
+        return _guessed(image, label, camera, camera_height_m)
+
+
+def _guessed(image: UInt8, label: UInt8 | None, camera: Camera, camera_height_m: float) -> Float32:
+    """From the label, or from the picture alone where there is none or it ignores everything."""
+    if label is not None and (label != IGNORE).any():
         return geometric_prior_depth(
             label,
             focal_px=camera.focal_px[1],
             principal_px=camera.principal_px,
             camera_height_m=camera_height_m,
         )
+    _warn_once()
+    return depth_from_picture(
+        image,
+        focal_px=camera.focal_px[1],
+        principal_px=camera.principal_px,
+        camera_height_m=camera_height_m,
+    )
+
+
+def _warn_once() -> None:
+    global _warned
+    if _warned:
+        return
+    _warned = True
+    warnings.warn(
+        "depth is guessed from pictures alone (flat ground, upright things), since there is "
+        "neither depth nor mask; give depth=, masks, depth_cache= or depth_network= for better "
+        "weather",
+        GuessedDepthWarning,
+        stacklevel=4,
+    )

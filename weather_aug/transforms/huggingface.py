@@ -35,9 +35,9 @@ class RandomWeather:
 
         A row's mask may be None; depth is then found from the picture alone.
 
-        Draws hang on `seed`, the worker's seed and the number of the call, so no two are alike. With
-        `sample` they hang on `seed`, `set_epoch` and that column alone: the same weather for any
-        number of workers. No global generator is read or moved.
+        Draws hang on `seed`, the worker's seed and the number of the call, so no two are alike.
+        With `sample` they hang on `seed`, `set_epoch` and that column alone: the same weather for
+        any number of workers. No global generator is read or moved.
 
     Args:
         policy: Which weather how often, or its `to_dict` form.
@@ -46,7 +46,7 @@ class RandomWeather:
         mask: Column of label masks; None if nobody labelled.
         depth: Column of z-depths in metres: (H, W) float arrays, or PIL pictures of mode F.
         scene_key: Column of the pictures' frames in one of `scenes`; see `SceneKey`.
-        sample: Column of integers or strings, a different one in each row, that decides its weather.
+        sample: Column of integers or strings, different in each row, that decides its weather.
         seed: Of all draws.
         scenes: Folders of scenes for `scene_key`.
         how: `speed_m_per_s`, `camera_height_m`, `hfov_deg`, `options`, `taxonomy`, `ignore_index`,
@@ -76,11 +76,11 @@ class RandomWeather:
         self.image = image
         self.mask = mask
         named = {"mask": mask, "depth": depth, "scene_key": scene_key, "sample": sample}
-        self.columns = {name: column for name, column in named.items() if column is not None}
+        self.columns = {"picture": image} | {name: c for name, c in named.items() if c is not None}
 
     def __call__(self, batch: Batch) -> dict[str, Any]:
         """The batch, or the row, in its weathers."""
-        for column in (self.image, *self.columns.values()):
+        for column in self.columns.values():
             if column not in batch:
                 raise ArgumentError(
                     f"there is no column {printable(column)!r}; there are "
@@ -88,17 +88,14 @@ class RandomWeather:
                     "image='image', mask='annotation'), or mask=None if there are no labels"
                 )
         one = not isinstance(batch[self.image], list)
-        rows = {name: [batch[c]] if one else batch[c] for name, c in self.columns.items()}
-        pictures = [batch[self.image]] if one else batch[self.image]
-        done = [
-            self._row(picture, **{name: column[k] for name, column in rows.items()})
-            for k, picture in enumerate(pictures)
-        ]
-        # `map` gives a lazy mapping and keeps the columns it does not get back, as they are on disk.
+        columns = [[batch[column]] if one else batch[column] for column in self.columns.values()]
+        rows = [dict(zip(self.columns, row, strict=True)) for row in zip(*columns, strict=True)]
+        done = [self._row(**row) for row in rows]
+        # `map` gives a lazy mapping, and what it does not get back it keeps as it is on disk.
         weathered = dict(batch) if isinstance(batch, dict) else {}
-        for name, column in ((self.image, 0), (self.mask, 1)):
-            if name is not None:
-                weathered[name] = done[0][column] if one else [row[column] for row in done]
+        for k, column in enumerate((self.image,) if self.mask is None else (self.image, self.mask)):
+            values = [row[k] for row in done]
+            weathered[column] = values[0] if one else values
         return weathered
 
     def set_epoch(self, epoch: int) -> None:

@@ -36,18 +36,18 @@ class RandomWeather:
         `gt_depth_map`, …) stays the same object. The label counts as it is in `results`, after
         `reduce_zero_label` and `label_map`.
 
-        Depth is `results[depth_key]` where there is one, else what `Weathering` finds from the label
-        or, in pipelines without labels, from the picture alone. `results["camera"]` may hold a
-        `weather_aug.Camera`, `results["scene_key"]` the picture's frame in one of `scenes`.
+        Depth is `results[depth_key]` where there is one, else what `Weathering` finds from the
+        label or, in pipelines without labels, from the picture alone. `results["camera"]` may hold
+        a `weather_aug.Camera`, `results["scene_key"]` the picture's frame in one of `scenes`.
 
         Put it after the loading, before crops, flips, padding and `Normalize`: depth and camera
         belong to the whole picture. A `Resize` alone may come first (it then costs less), but not
         with depth, camera or scene of the picture in its first size.
 
-        Draws hang on `seed`, the worker's seed and the number of the call, so no two are alike. With
-        `keyed` they hang on `seed`, `set_epoch` and the sample's name (`sample_idx`, else its file)
-        alone: the same weather in each pass, as a test set wants it. No global generator is read or
-        moved.
+        Draws hang on `seed`, the worker's seed and the number of the call, so no two are alike.
+        With `keyed` they hang on `seed`, `set_epoch` and the sample's name (`sample_idx`, else its
+        file) alone: the same weather in each pass, as a test set wants it. No global generator is
+        read or moved.
 
     Args:
         policy: Which weather how often, or its `to_dict` form, such as `dict(types=dict(rain=1))`.

@@ -7,7 +7,7 @@ and these make a label map for the same geometric prior that serves labelled pic
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -26,6 +26,16 @@ UInt8 = NDArray[np.uint8]
 WORKING_WIDTH_PX = 320
 ABOVE_HORIZON_SHARE = 0.2
 CAR = TRAIN_ID["car"]
+
+
+class Surfaces(NamedTuple):
+    """What a picture shows, and how the camera stands."""
+
+    label: UInt8
+    """(H, W) train ids; of a guess road, sky, car for what is low and narrow, building for all else
+    that stands."""
+    pitch_rad: float
+    """How far the camera looks down."""
 
 
 def depth_from_picture(
@@ -54,13 +64,9 @@ def depth_from_picture(
         ArgumentError: If an argument has another type or shape, or is outside its range.
     """
     image = image_uint8("image", image)
-    finite("focal_px", focal_px, 1e-3)
-    finite("principal_px[0]", principal_px[0], -1e6, 1e6)
-    finite("principal_px[1]", principal_px[1], -1e6, 1e6)
-    pitch_rad = pitch_from_picture(image, focal_px=focal_px, principal_px=principal_px)
-    horizon_px = principal_px[1] - focal_px * math.tan(pitch_rad)
+    label, pitch_rad = surfaces_of(image, focal_px=focal_px, principal_px=principal_px)
     return geometric_prior_depth(
-        surfaces(image, horizon_px=horizon_px, focal_px=focal_px, principal_x_px=principal_px[0]),
+        label,
         focal_px=focal_px,
         principal_px=principal_px,
         camera_height_m=camera_height_m,
@@ -68,11 +74,16 @@ def depth_from_picture(
     )
 
 
-def surfaces(image: UInt8, *, horizon_px: float, focal_px: float, principal_x_px: float) -> UInt8:
-    """Train ids (H, W) of a picture that nobody labelled.
+def surfaces_of(image: UInt8, *, focal_px: float, principal_px: tuple[float, float]) -> Surfaces:
+    """What an unlabelled picture seems to show; see `depth_from_picture`.
 
-    Four classes: road, sky, car for what is low and narrow, building for all else that stands.
+    Raises:
+        ArgumentError: If an argument is outside its range.
     """
+    focal_px = finite("focal_px", focal_px, 1e-3)
+    x, y = (finite(f"principal_px[{i}]", principal_px[i], -1e6, 1e6) for i in range(2))
+    pitch_rad = pitch_from_picture(image, focal_px=focal_px, principal_px=(x, y))
+    horizon_px = y - focal_px * math.tan(pitch_rad)
     height, width = image.shape[:2]
     scale = min(1.0, WORKING_WIDTH_PX / width)
     size = max(1, round(width * scale)), max(1, round(height * scale))
@@ -84,7 +95,7 @@ def surfaces(image: UInt8, *, horizon_px: float, focal_px: float, principal_x_px
         sky,
         horizon_px=horizon,
         focal_px=focal_px * scale,
-        principal_x_px=(principal_x_px + 0.5) * scale - 0.5,
+        principal_x_px=(x + 0.5) * scale - 0.5,
     )
     behind = edge_behind(edge, horizon)
     drop = edge - horizon
@@ -93,7 +104,7 @@ def surfaces(image: UInt8, *, horizon_px: float, focal_px: float, principal_x_px
     ground, low = (rows >= _rows_at(line, width, scale) for line in (edge, top))
     high = cv2.resize(sky.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
     standing = np.where(low, CAR, np.where(high > 0.5, SKY, BUILDING))
-    return np.where(ground, ROAD, standing).astype(np.uint8)
+    return Surfaces(np.where(ground, ROAD, standing).astype(np.uint8), pitch_rad)
 
 
 def _open_sky(image: UInt8, horizon_px: float) -> NDArray[np.bool_]:

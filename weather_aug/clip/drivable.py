@@ -115,7 +115,8 @@ def _log_odds(words: Int32, share: Float32, seen: Float32) -> Float32:
     shape = (LEVELS,) * (3 if words.max() >= LEVELS else 1)
     counts = []
     for weight in (share * seen, (1 - share) * seen):
-        count = np.bincount(words.ravel(), weight.ravel(), int(np.prod(shape))).reshape(shape)
+        binned = np.bincount(words.ravel(), weight.ravel(), int(np.prod(shape)))
+        count = binned.astype(np.float64).reshape(shape)
         for axis in range(len(shape)):
             count = _smoothed(count, axis)
         counts.append(count / max(count.sum(), 1.0))

@@ -55,7 +55,7 @@ def pitch_from_picture(
 
 def _steps(reach: float) -> NDArray[np.float64]:
     count = int(reach / STEP_PX)
-    return np.arange(-count, count + 1) * STEP_PX
+    return STEP_PX * np.arange(-count, count + 1, dtype=np.float64)
 
 
 def _segments(image: NDArray[np.uint8]) -> NDArray[np.float64]:

@@ -7,24 +7,27 @@ and these make a label map for the same geometric prior that serves labelled pic
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug._checks import finite, image_uint8
+from weather_aug.clip.completion import completed
 from weather_aug.clip.drivable import edge_behind, ground_edge
-from weather_aug.clip.horizon import pitch_from_picture
-from weather_aug.clip.prior import geometric_prior_depth
+from weather_aug.clip.horizon import pitch_from_picture, shrunk
+from weather_aug.clip.prior import MAX_DEPTH_M, MIN_DEPTH_M, geometric_prior_depth
 from weather_aug.clip.sky import sky_mask
 from weather_aug.taxonomy import BUILDING, ROAD, SKY, TRAIN_ID
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 
-WORKING_WIDTH_PX = 320
 ABOVE_HORIZON_SHARE = 0.2
+GROUND_CONFIDENCE, FOOT_CONFIDENCE, FACADE_CONFIDENCE = 100.0, 1.0, 3e-3
+FOOT_ROWS = 3
+SWEEPS = 8
 CAR = TRAIN_ID["car"]
 
 
@@ -64,14 +67,39 @@ def depth_from_picture(
         ArgumentError: If an argument has another type or shape, or is outside its range.
     """
     image = image_uint8("image", image)
-    label, pitch_rad = surfaces_of(image, focal_px=focal_px, principal_px=principal_px)
-    return geometric_prior_depth(
-        label,
-        focal_px=focal_px,
-        principal_px=principal_px,
+    finite("camera_height_m", camera_height_m, 0.1, 100.0)
+    parted = _parted(image, focal_px, principal_px)
+    prior = geometric_prior_depth(
+        parted.label,
+        focal_px=focal_px * parted.scale,
+        principal_px=parted.principal_px,
         camera_height_m=camera_height_m,
-        pitch_rad=pitch_rad,
+        pitch_rad=parted.pitch_rad,
     )
+    sky = parted.label == SKY
+    # In inverse depth the ground is linear, and a membrane over it stays flat.
+    inverse = completed(
+        np.reciprocal(prior), _confidence(parted.label), parted.image, barrier=sky, sweeps=SWEEPS
+    )
+    height, width = image.shape[:2]
+    grown = cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR)
+    depth = 1 / np.clip(grown, 1 / MAX_DEPTH_M, 1 / MIN_DEPTH_M)
+    depth[_grown(sky, image.shape) > 0.5] = np.inf
+    return np.asarray(depth, np.float32)
+
+
+def _confidence(label: UInt8) -> Float32:
+    """How far the prior is believed: on the ground, less at a foot, hardly above it."""
+    confidence = np.full(label.shape, FACADE_CONFIDENCE, np.float32)
+    confidence[label == CAR] = 0
+    confidence[(label == ROAD)] = GROUND_CONFIDENCE
+    stands = (label == BUILDING) | (label == CAR)
+    foot = np.zeros_like(stands)
+    for rows in range(1, FOOT_ROWS + 1):
+        foot[:-rows] |= stands[:-rows] & (label[rows:] == ROAD)
+    confidence[foot] = FOOT_CONFIDENCE
+    confidence[label == SKY] = 0
+    return confidence
 
 
 def surfaces_of(image: UInt8, *, focal_px: float, principal_px: tuple[float, float]) -> Surfaces:
@@ -80,31 +108,44 @@ def surfaces_of(image: UInt8, *, focal_px: float, principal_px: tuple[float, flo
     Raises:
         ArgumentError: If an argument is outside its range.
     """
+    parted = _parted(image, focal_px, principal_px)
+    size = image.shape[1::-1]
+    label = cv2.resize(parted.label, size, interpolation=cv2.INTER_NEAREST_EXACT)
+    return Surfaces(np.asarray(label), parted.pitch_rad)
+
+
+class _Parted(NamedTuple):
+    """A picture, shrunk by `scale`, and what it seems to show."""
+
+    image: UInt8
+    label: UInt8
+    scale: float
+    principal_px: tuple[float, float]
+    pitch_rad: float
+
+
+def _parted(image: UInt8, focal_px: float, principal_px: tuple[float, float]) -> _Parted:
     focal_px = finite("focal_px", focal_px, 1e-3)
     x, y = (finite(f"principal_px[{i}]", principal_px[i], -1e6, 1e6) for i in range(2))
-    pitch_rad = pitch_from_picture(image, focal_px=focal_px, principal_px=(x, y))
+    small, scale = shrunk(image)
+    # Pixel centres sit at integers, so the picture starts half a pixel before 0.
+    x, y, focal_px = (x + 0.5) * scale - 0.5, (y + 0.5) * scale - 0.5, focal_px * scale
+    pitch_rad = pitch_from_picture(small, focal_px=focal_px, principal_px=(x, y))
     horizon_px = y - focal_px * math.tan(pitch_rad)
-    height, width = image.shape[:2]
-    scale = min(1.0, WORKING_WIDTH_PX / width)
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    horizon = (horizon_px + 0.5) * scale - 0.5
-    sky = _open_sky(small, horizon)
-    edge = ground_edge(
-        small,
-        sky,
-        horizon_px=horizon,
-        focal_px=focal_px * scale,
-        principal_x_px=(x + 0.5) * scale - 0.5,
-    )
-    behind = edge_behind(edge, horizon)
-    drop = edge - horizon
-    top = np.where(behind < edge, horizon - ABOVE_HORIZON_SHARE * drop, edge)
-    rows = np.arange(height)[:, None]
-    ground, low = (rows >= _rows_at(line, width, scale) for line in (edge, top))
-    high = cv2.resize(sky.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
-    standing = np.where(low, CAR, np.where(high > 0.5, SKY, BUILDING))
-    return Surfaces(np.where(ground, ROAD, standing).astype(np.uint8), pitch_rad)
+    sky = _open_sky(small, horizon_px)
+    edge = ground_edge(small, sky, horizon_px=horizon_px, focal_px=focal_px, principal_x_px=x)
+    behind = edge_behind(edge, horizon_px)
+    top = np.where(behind < edge, horizon_px - ABOVE_HORIZON_SHARE * (edge - horizon_px), edge)
+    rows = np.arange(len(small))[:, None]
+    standing = np.where(rows >= np.rint(top), CAR, np.where(sky, SKY, BUILDING))
+    label = np.where(rows >= edge, ROAD, standing).astype(np.uint8)
+    return _Parted(small, label, scale, (x, y), pitch_rad)
+
+
+def _grown(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> Float32:
+    """A mask of the small picture as shares of the whole one's pixels, (H, W)."""
+    share = mask.astype(np.float32)
+    return np.asarray(cv2.resize(share, shape[1::-1], interpolation=cv2.INTER_LINEAR))
 
 
 def _open_sky(image: UInt8, horizon_px: float) -> NDArray[np.bool_]:
@@ -114,10 +155,3 @@ def _open_sky(image: UInt8, horizon_px: float) -> NDArray[np.bool_]:
     sky[int(np.clip(np.floor(horizon_px) + 1, 0, len(sky))) :] = False
     _, parts = cv2.connectedComponents(cv2.dilate(sky.astype(np.uint8), np.ones((3, 3), np.uint8)))
     return np.isin(parts, np.unique(parts[:2][sky[:2]])) & sky
-
-
-def _rows_at(line: NDArray[Any], width: int, scale: float) -> Float32:
-    """A line of rows (w,) of the small picture at the columns of the whole one, (W,)."""
-    row = line.astype(np.float32)[None]
-    grown = cv2.resize(row, (width, 1), interpolation=cv2.INTER_LINEAR)[0]
-    return np.rint((grown + np.float32(0.5)) / np.float32(scale) - np.float32(0.5))

@@ -1,4 +1,4 @@
-"""Where the horizon of a level-standing camera is, from the lines that run along the street."""
+"""How far a camera looks down, from the lines that run along the street to the horizon."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-WORKING_WIDTH_PX = 320
+from weather_aug._compiled import compiled
+
+WIDEST_PX, TALLEST_PX = 320, 640
 STEEPEST_RAD = math.radians(10.0)
 USUAL_PITCH_RAD = math.radians(3.0)
 SIDEWAYS_SHARE = 0.3
-STEP_PX = 2.0
+ROW_STEP_PX, COLUMN_STEP_PX = 2.0, 4.0
 TOLERANCE_RAD = math.radians(2.0)
 LEAST_SINE, GREATEST_SINE = 0.06, 0.97
 LEAST_LENGTH_SHARE = 0.03
@@ -37,25 +39,33 @@ def pitch_from_picture(
     Returns:
         Radians in [-0.175, 0.175], above 0 where the camera looks down.
     """
-    height, width = image.shape[:2]
-    scale = min(1.0, WORKING_WIDTH_PX / width)
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    segments = _segments(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+    small, scale = shrunk(image)
+    height, width = small.shape[:2]
+    segments = _segments(small)
     # Pixel centres sit at integers, so the picture starts half a pixel before 0.
-    centre = (np.array(principal_px) + 0.5) * scale - 0.5
+    centre_x, centre_y = ((place + 0.5) * scale - 0.5 for place in principal_px)
     focal = focal_px * scale
-    pitches = np.arctan(_steps(focal * math.tan(STEEPEST_RAD)) / focal)
-    rows = centre[1] - focal * np.tan(pitches)
-    columns = centre[0] + _steps(SIDEWAYS_SHARE * size[0])
-    score = _length_through(segments, rows, columns).max(axis=1) / size[0]
-    score = BELIEF * score / (SURE_LENGTH + segments[:, 4].sum() / size[0])
+    reach = min(focal * math.tan(STEEPEST_RAD), float(height))
+    pitches = np.arctan(_steps(reach, ROW_STEP_PX) / focal)
+    rows = centre_y - focal * np.tan(pitches)
+    columns = centre_x + _steps(SIDEWAYS_SHARE * width, COLUMN_STEP_PX)
+    score = _length_through(segments, rows, columns).max(axis=1) / width
+    score = BELIEF * score / (SURE_LENGTH + segments[:, 4].sum() / width)
     likely = score - 0.5 * (pitches / USUAL_PITCH_RAD) ** 2
     return float(pitches[int(likely.argmax())])
 
 
-def _steps(reach: float) -> NDArray[np.float64]:
-    count = int(reach / STEP_PX)
-    return STEP_PX * np.arange(-count, count + 1, dtype=np.float64)
+def shrunk(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
+    """A copy of at most 320 x 640 pixels, and its scale: 1 where the picture is no larger."""
+    height, width = image.shape[:2]
+    scale = min(1.0, WIDEST_PX / width, TALLEST_PX / height)
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA)), scale
+
+
+def _steps(reach: float, step: float) -> NDArray[np.float64]:
+    count = int(reach / step)
+    return step * np.arange(-count, count + 1, dtype=np.float64)
 
 
 def _segments(image: NDArray[np.uint8]) -> NDArray[np.float64]:
@@ -74,13 +84,19 @@ def _segments(image: NDArray[np.uint8]) -> NDArray[np.float64]:
     return np.column_stack([middle, unit, length])[kept]
 
 
+@compiled
 def _length_through(
     segments: NDArray[np.float64], rows: NDArray[np.float64], columns: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """(R, C) length of the segments that point at each place, less where they miss it."""
-    x, y, ux, uy, length = segments.T[:, :, None, None]
-    dx, dy = columns[None, None, :] - x, rows[None, :, None] - y
-    off = np.abs(dx * uy - dy * ux) / np.maximum(np.hypot(dx, dy), 1.0)
-    through = length * np.maximum(0.0, 1.0 - off / TOLERANCE_RAD)
-    total: NDArray[np.float64] = through.sum(axis=0)
+    total = np.zeros((len(rows), len(columns)))
+    for index in range(len(segments)):
+        x, y, along_x, along_y, length = segments[index]
+        for i in range(len(rows)):
+            dy = rows[i] - y
+            for j in range(len(columns)):
+                dx = columns[j] - x
+                off = abs(dx * along_y - dy * along_x) / max(math.sqrt(dx * dx + dy * dy), 1.0)
+                if off < TOLERANCE_RAD:
+                    total[i, j] += length * (1.0 - off / TOLERANCE_RAD)
     return total

@@ -12,18 +12,20 @@ both are asked about held-out pictures in clear weather, rain, snow and fog, and
 they answer is written. A hundred iterations make no good net; they show that the loop runs, that
 the loss falls, and what an iteration costs.
 
-How the cost is measured: the nets take turns, ten iterations each, so that whatever else the
-machine does hits both alike. The first iterations of a turn use batches that were drawn while the
-other net had its turn; they are not counted. Given are the median over the turns, and of the cost
-the median over pairs of turns. The loaders differ in the policy alone. Each has one worker, the net
-has one thread: on two cores weather is drawn beside the training and takes next to nothing from it,
-as long as the worker is faster than the net; the loaders' own speed is printed, too. Where the net
-takes all cores for itself (`--threads 2` on two cores) weather has to share them, and costs more.
+How the cost is measured: the nets take turns of ten iterations, so that whatever else the machine
+does hits both alike. The first iterations of a turn use batches that were drawn while the other net
+had its turn; they do not count. Given are the median over the turns, and of the cost the median
+over pairs of turns. The loaders differ in the policy alone. Each has one worker, the net has one
+thread: where two cores are free, weather is drawn beside the training and takes next to nothing
+from it, as long as the worker is faster than the net; the loaders' own speed is printed, too. Where
+no core is free for the worker, because the net takes all (`--threads 2` on two cores) or because
+others are at work (see the load), weather takes its time from the net.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import tempfile
 import time
 from collections.abc import Iterator
@@ -55,7 +57,6 @@ MEAN, SCALE = 110.0, 60.0
 """Of the pixels of an everyday street, roughly."""
 QUEUED = 2
 """Batches that a worker draws ahead."""
-SETTLING = QUEUED + 1
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,8 @@ class Plan:
     """What is trained on what, and for how long."""
 
     iterations: int = 100
-    turn: int = 10
+    timed: int = 7
+    """Iterations of a turn that count."""
     batch: int = 4
     crop: tuple[int, int] = (256, 256)
     workers: int = 1
@@ -71,8 +73,13 @@ class Plan:
     street: str = "frames=10&width=480&height=270"
     seed: int = 0
 
+    @property
+    def settling(self) -> int:
+        """Iterations of a turn before those: batches that were drawn ahead, and one more."""
+        return self.workers * QUEUED + 1
 
-QUICK = Plan(6, 6, 2, (96, 96), widths=(8, 16, 16, 16), street="frames=2&width=192&height=108")
+
+QUICK = Plan(6, 3, 2, (96, 96), widths=(8, 16, 16, 16), street="frames=2&width=192&height=108")
 
 
 @dataclass
@@ -174,16 +181,17 @@ def normalised(images: torch.Tensor) -> torch.Tensor:
 def train(arms: dict[str, Arm], plan: Plan) -> None:
     """Train all arms in turns; the one that was last is first in the next round."""
     order = list(arms.values())
-    for done in range(0, plan.iterations, plan.turn):
-        steps = min(plan.turn, plan.iterations - done)
+    turn = plan.settling + plan.timed
+    for done in range(0, plan.iterations, turn):
+        steps = min(turn, plan.iterations - done)
         for arm in order:
-            for _ in range(min(SETTLING, steps)):
+            for _ in range(min(plan.settling, steps)):
                 step(arm)
             start = time.perf_counter()
-            for _ in range(SETTLING, steps):
+            for _ in range(plan.settling, steps):
                 step(arm)
-            if steps > SETTLING:
-                arm.per_s.append((steps - SETTLING) / (time.perf_counter() - start))
+            if steps > plan.settling:
+                arm.per_s.append((steps - plan.settling) / (time.perf_counter() - start))
         order.reverse()
 
 
@@ -195,12 +203,12 @@ def cost(arms: dict[str, Arm]) -> float:
 
 def loader_per_s(arm: Arm, plan: Plan) -> float:
     """Batches per second when nobody trains on them."""
-    for _ in islice(arm.batches, SETTLING * plan.workers):
+    for _ in islice(arm.batches, plan.settling):
         pass
     start = time.perf_counter()
-    for _ in islice(arm.batches, plan.turn):
+    for _ in islice(arm.batches, 2 * plan.timed):
         pass
-    return plan.turn / (time.perf_counter() - start)
+    return 2 * plan.timed / (time.perf_counter() - start)
 
 
 @torch.no_grad()
@@ -246,7 +254,8 @@ def run(data: Path | None, plan: Plan, out: Path) -> dict[str, Arm]:
             f"{len(train_scene.keys)} pictures, crops {plan.crop[0]} x {plan.crop[1]}, batch "
             f"{plan.batch}; a net of {sum(p.numel() for p in net.parameters()):,} weights; "
             f"threads: {torch.get_num_threads()}, workers: {plan.workers}; "
-            f"{plan.iterations} iterations"
+            f"{plan.iterations} iterations, on {os.cpu_count()} cores under a load of "
+            f"{os.getloadavg()[0]:.1f}"
         )
         train(arms, plan)
         for name, arm in arms.items():
@@ -273,7 +282,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("data", type=Path, nargs="?", help="a folder of CamVid; a street if none")
-    parser.add_argument("--iterations", type=int, help=f"more than {SETTLING}; 100")
+    parser.add_argument("--iterations", type=int, help="100 if not given")
     parser.add_argument("--threads", type=int, default=1, help="of the net")
     parser.add_argument("--workers", type=int, default=1, help="of each loader")
     parser.add_argument("--out", type=Path, default=Path("out/train_camvid.png"))
@@ -282,9 +291,10 @@ def main() -> None:
     plan = replace(QUICK if given.quick else Plan(), workers=given.workers)
     if given.iterations is not None:
         plan = replace(plan, iterations=given.iterations)
-    if plan.iterations <= SETTLING or plan.workers < 1 or given.threads < 1:
+    if min(plan.workers, given.threads) < 1 or plan.iterations <= plan.settling:
         parser.error(
-            f"--iterations must be more than {SETTLING}, --workers and --threads at least 1"
+            f"--threads and --workers must be at least 1, --iterations more than {plan.settling}: "
+            "the first ones of a turn do not count"
         )
     torch.set_num_threads(given.threads)
     run(given.data, plan, given.out)

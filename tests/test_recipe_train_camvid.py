@@ -99,7 +99,7 @@ def test_a_training_without_anything_to_time_is_refused(recipe, monkeypatch, cap
     with pytest.raises(SystemExit) as ended:
         recipe.main()
     assert ended.value.code == 2
-    assert "--iterations must be more than 3" in capsys.readouterr().err
+    assert "must be at least 1, --iterations more than" in capsys.readouterr().err
 
 
 def test_nets_are_those_of_their_seed(recipe, plan):
@@ -159,12 +159,12 @@ def test_turns_alternate_and_their_first_iterations_are_not_timed(recipe, plan, 
     def step(arm):
         number = sum(name == arm.net for name in steps) % 5
         steps.append(arm.net)
-        now[0] += 100.0 if number < recipe.SETTLING else 1.0
+        now[0] += 100.0 if number < plan.settling else 1.0
 
     monkeypatch.setattr(recipe, "step", step)
     monkeypatch.setattr(recipe.time, "perf_counter", lambda: now[0])
     arms = {name: recipe.Arm(name, None, iter(())) for name in ("a", "b")}
-    recipe.train(arms, replace(plan, iterations=12, turn=5))
+    recipe.train(arms, replace(plan, iterations=12, timed=2))
     assert "".join(steps) == "aaaaabbbbbbbbbbaaaaaaabb"
     assert [arm.per_s for arm in arms.values()] == [[1.0, 1.0], [1.0, 1.0]]
 

@@ -48,7 +48,7 @@ from weather_aug.transforms.items import (
     tensors_of,
     tuple_of,
 )
-from weather_aug.transforms.order import dealt
+from weather_aug.transforms.permutation import dealt
 from weather_aug.transforms.resume import STATE_VERSION, checked_state, fingerprint_of
 from weather_aug.transforms.sampling import Choice, Sampling, Uniform
 from weather_aug.transforms.sources import Opened, Source, sources_of

@@ -48,7 +48,7 @@ from weather_aug.transforms.items import (
     tensors_of,
     tuple_of,
 )
-from weather_aug.transforms.order import dealt
+from weather_aug.transforms.permutation import dealt
 from weather_aug.transforms.resume import STATE_VERSION, checked_state, fingerprint_of
 from weather_aug.transforms.sampling import Choice, Sampling, Uniform
 from weather_aug.transforms.sources import Opened, Source, sources_of
@@ -94,7 +94,8 @@ class WeatherDataset(Dataset[Any]):
         output: "dict", or "tuple" for (image, label) tensors.
         with_clear: Add the same picture without weather, `clear` (3, H, W) uint8, for training on
             pairs; of a tuple the third.
-        depth: Where depth comes from for clips without.
+        depth: Where depth comes from for clips whose frames have none. Folders with labels have it
+            from the labels, unless there is a folder of depth.
 
     Raises:
         ArgumentError: If there are no scenes, some of their frames have labels and some have none,
@@ -198,8 +199,7 @@ class WeatherDataset(Dataset[Any]):
         shot = rendered(opened, draw.weather, draw.seed, asked)
         if (shot.label is not None) != self._is_labelled:
             raise mixed(source, key, has_label=shot.label is not None)
-        head = source.recipe_head(self._sources.index(source))
-        sample = sample_of(shot, recipe_of(head, key, draw, asked))
+        sample = sample_of(shot, recipe_of(source.recipe_head(), key, draw, asked))
         if self.with_clear:
             sample["clear"] = clear_of(opened, shot, asked)
         if self.transform is not None:
@@ -217,8 +217,8 @@ class WeatherDataset(Dataset[Any]):
             ArgumentError: If its scene or clip is not among them.
         """
         fields = json.loads(recipe) if isinstance(recipe, str) else recipe
-        for place, source in enumerate(self._sources):
-            head = source.recipe_head(place)
+        for source in self._sources:
+            head = source.recipe_head()
             if head == {name: fields.get(name) for name in head}:
                 key = FrameKey(fields["time_index"], fields["camera"])
                 return rendered_again(source.open(key), fields)

@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader, Sampler
 from weather_aug._keys import check_seed
 from weather_aug.errors import ArgumentError
 from weather_aug.transforms.dataset import WeatherDataset
-from weather_aug.transforms.order import permutation
+from weather_aug.transforms.permutation import permutation
 from weather_aug.transforms.resume import STATE_VERSION, checked_state, fingerprint_of
 
 
@@ -103,7 +103,7 @@ class WeatherSampler(Sampler[int]):
 
     def __iter__(self) -> Iterator[int]:
         self._iterated_epoch = self.epoch
-        yield from self._padded()[self.rank :: self.ranks].tolist()
+        yield from map(int, self._padded()[self.rank :: self.ranks])
 
     def follow(self, loader: DataLoader[Any]) -> Iterator[Any]:
         """The loader's batches; a batch counts as used as soon as it is handed out.

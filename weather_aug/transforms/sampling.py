@@ -16,7 +16,7 @@ from weather_aug._checks import finite
 from weather_aug._keys import key_of, uniforms
 from weather_aug.errors import ArgumentError, printable
 from weather_aug.taxonomy import CLASSES
-from weather_aug.transforms.order import permutation
+from weather_aug.transforms.permutation import permutation
 
 UInt8 = NDArray[np.uint8]
 

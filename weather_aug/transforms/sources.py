@@ -77,8 +77,8 @@ class Source(Protocol):
     def __str__(self) -> str:
         """What messages call it."""
 
-    def recipe_head(self, place: int) -> dict[str, Any]:
-        """What recipes of its frames begin with; `place` is its own among the sources."""
+    def recipe_head(self) -> dict[str, Any]:
+        """What recipes of its frames begin with."""
 
     def digest(self) -> str:
         """16 hexadecimal digits that differ where the frames do, as far as can be told cheaply."""
@@ -109,8 +109,8 @@ def sources_of(given: Any, depth: DepthSource) -> tuple[Source, ...]:
             "scenes must be one or more of WeatherScene.load(folder) and open_clip(address)"
         )
     return tuple(
-        SceneSource(one) if isinstance(one, WeatherScene) else ClipSource(one, depth)
-        for one in each
+        SceneSource(one) if isinstance(one, WeatherScene) else ClipSource(one, depth, place)
+        for place, one in enumerate(each)
     )
 
 
@@ -128,7 +128,7 @@ class SceneSource:
         """Of all frames."""
         return self.given.keys
 
-    def recipe_head(self, place: int) -> dict[str, Any]:
+    def recipe_head(self) -> dict[str, Any]:
         """The scene by name and digest, wherever it stands."""
         return {"scene": self.given.name, "scene_digest": self.given.digest}
 
@@ -211,26 +211,27 @@ class ClipSource:
         ClipError: If a file of it cannot be read.
     """
 
-    def __init__(self, clip: Clip, depth: DepthSource) -> None:
+    def __init__(self, clip: Clip, depth: DepthSource, place: int) -> None:
         self.given = clip
-        self.depth = depth
+        self._depth = depth
+        self._place = place
         self.keys: Sequence[FrameKey] = tuple(clip.keys)
         if not self.keys:
             raise ArgumentError(f"scenes holds clip {clip.name}, which has no frames")
         text = "\n".join([clip.name, *map(str, self.keys)])
         self._digest = hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
         first = clip.frame(self.keys[0])
-        self.first_time_s = first.time_s
+        self._first_time_s = first.time_s
         self._first = Known(first.key, _size(first), first.label is not None)
         is_drive = bool(getattr(clip, "is_drive", True))
-        self.drive = self._drive_light() if is_drive else None
+        self._drive = self._drive_light() if is_drive else None
 
     def __str__(self) -> str:
         return f"clip {self.given.name}"
 
-    def recipe_head(self, place: int) -> dict[str, Any]:
+    def recipe_head(self) -> dict[str, Any]:
         """The clip by its place among the sources: nothing else is sure to tell two apart."""
-        return {"source": place, "clip": self.given.name}
+        return {"source": self._place, "clip": self.given.name}
 
     def digest(self) -> str:
         """Of the clip's name and its frames' names; their content would take a pass over all."""
@@ -258,16 +259,16 @@ class ClipSource:
         depth_m = frame.depth_m
         if depth_m is None:
             height_m = getattr(self.given, "camera_height_m", CAMERA_HEIGHT_M)
-            depth_m = self.depth.depth_m(frame.image, frame.label, frame.camera, height_m)
-        return replace(frame, depth_m=depth_m, time_s=frame.time_s - self.first_time_s)
+            depth_m = self._depth.depth_m(frame.image, frame.label, frame.camera, height_m)
+        return replace(frame, depth_m=depth_m, time_s=frame.time_s - self._first_time_s)
 
     def light_of(self, frame: Frame) -> Ambience:
         """Light and axes around a frame."""
-        if self.drive is None:
+        if self._drive is None:
             return ambience_of(frame, self._axes([frame]))
-        height_m = self.drive.camera_height_m[frame.key.camera]
-        own = ambience_of(frame, self.drive.axes_world)
-        return replace(own, airlight=self.drive.airlight, camera_height_m=height_m)
+        height_m = self._drive.camera_height_m[frame.key.camera]
+        own = ambience_of(frame, self._drive.axes_world)
+        return replace(own, airlight=self._drive.airlight, camera_height_m=height_m)
 
     def rig_of(self, key: FrameKey) -> RigMotion:
         """Of the first camera, up to the moment of a frame or to the last one before it."""

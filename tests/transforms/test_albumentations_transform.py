@@ -113,21 +113,6 @@ def test_global_generators_do_not_matter(sample: Sample) -> None:
     assert np.random.get_state()[1].tolist() == state  # noqa: NPY002
 
 
-def test_a_pipeline_survives_its_dictionary(sample: Sample) -> None:
-    original = pipeline(speed_m_per_s=(3.0, 9.0), camera_height_m=1.2, max_particles=900)
-    text = json.dumps(A.to_dict(original))
-    again = A.from_dict(json.loads(text))
-    again.set_random_seed(7)
-    transform = again.transforms[0]
-    assert isinstance(transform, RandomWeather)
-    chosen = transform.weathering
-    assert chosen.policy == SNOW
-    assert (chosen.speed_m_per_s, chosen.camera_height_m) == ((3.0, 9.0), 1.2)
-    assert chosen.options.max_particles == 900
-    expected, actual = original(**sample), again(**sample)
-    assert all((expected[name] == actual[name]).all() for name in ("image", "mask"))
-
-
 def test_effects_are_left_out_by_name(sample: Sample) -> None:
     rain = WeatherPolicy({"rain": 1}, severity=(1.0, 1.0), falling=1.0)
     whole = pipeline(rain)(**sample)["image"]
@@ -142,17 +127,6 @@ def test_effects_are_left_out_by_name(sample: Sample) -> None:
     few = RandomWeather(options=options, max_particles=7).weathering.options
     assert few == replace(options, max_particles=7)
     assert RandomWeather(options=options).weathering.options == options
-
-
-def test_a_replay_gives_the_same_picture(sample: Sample) -> None:
-    weather = RandomWeather(SNOW, p=1.0)
-    recorder = A.ReplayCompose([weather], additional_targets={"depth": "mask"})
-    done = recorder(**sample)
-    replay = json.loads(json.dumps(done["replay"]))
-    again = A.ReplayCompose.replay(replay, **sample)
-    assert (done["image"] != sample["image"]).any()
-    assert (again["image"] == done["image"]).all()
-    assert (again["mask"] == done["mask"]).all()
 
 
 def test_depth_comes_from_the_call_where_it_is_given(sample: Sample) -> None:

@@ -44,7 +44,7 @@ from weather_aug.transforms.dataset import WeatherDataset
 WORKERS, BATCH, QUEUED = 2, 2, 2
 SETTLING = WORKERS * (QUEUED + 1)
 """Batches not counted at the start of a turn: workers start, and their queues are filled."""
-ROUNDS, TURN_S, LEAST_BATCHES = 7, 2.0, 6
+ROUNDS, TURN_S, LEAST_BATCHES = 7, 2.0, 16
 SAMPLES = 4096
 """Of an epoch: more than a turn can take."""
 POLICY = WeatherPolicy()

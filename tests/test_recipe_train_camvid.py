@@ -57,7 +57,7 @@ def trained(recipe, plan, tiny_scene):
     return run
 
 
-def run(folder, *words, timeout=300):
+def run(folder, *words, timeout=600):
     return subprocess.run(
         [sys.executable, str(RECIPE), *words],
         cwd=folder,

@@ -288,3 +288,15 @@ def test_an_unknown_type_or_bad_key_is_refused() -> None:
     for key in ((2**64, 0, 0), (0, 1.5, 0), (0, 0, True)):
         with pytest.raises(ArgumentError, match="integer"):
             WeatherPolicy().draw(*key)  # type: ignore[arg-type]
+
+
+@given(types, st.randoms(use_true_random=False), st.integers(0, 999))
+def test_equal_policies_draw_equally(
+    weights: dict[str, float], shuffle: random.Random, item: int
+) -> None:
+    """A file may list the types in another order; YAML sorts them."""
+    names = [*weights]
+    shuffle.shuffle(names)
+    other = WeatherPolicy({name: weights[name] for name in names})
+    assert other == WeatherPolicy(weights)
+    assert other.draw(3, 0, item) == WeatherPolicy(weights).draw(3, 0, item)

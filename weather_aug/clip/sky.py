@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from weather_aug.clip.completion import greatest
+
 WORKING_WIDTH_PX = 640
 MIN_BRIGHTNESS = 130
 MIN_BLUE_BRIGHTNESS = 80
@@ -91,7 +93,7 @@ def _dull(image: NDArray[np.uint8], sky: NDArray[np.bool_]) -> NDArray[np.bool_]
     """Grey pixels well below the brightest tenth of the sky: the side of a white lorry."""
     if not sky.any():
         return np.zeros_like(sky)
-    brightness = image.max(axis=2)
+    brightness = greatest(image)
     blueish = image[..., 2] > image[..., 0].astype(np.int16) + DEEP_BLUE
     return np.asarray((brightness < DULL_SHARE * np.percentile(brightness[sky], 90)) & ~blueish)
 
@@ -107,7 +109,7 @@ def _local_mean(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np
 
 def _gaps(image: NDArray[np.uint8], sky: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Pixels near the open sky that have its colour, such as holes in foliage."""
-    off = np.abs(image.astype(np.float32) - _local_mean(image, sky)).max(axis=2)
+    off = greatest(np.abs(image.astype(np.float32) - _local_mean(image, sky)))
     return np.asarray(off < GAP_GREY_LEVELS)
 
 
@@ -115,8 +117,8 @@ def _rim(image: NDArray[np.uint8], sky: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The blurred pixels at the border, given to the side whose colour they are closer to."""
     kernel = np.ones((5, 5), np.uint8)
     ring = (cv2.dilate(sky.astype(np.uint8), kernel) > 0) & ~sky
-    to_sky = np.abs(image.astype(np.float32) - _local_mean(image, sky)).max(axis=2)
-    to_land = np.abs(image.astype(np.float32) - _local_mean(image, ~sky)).max(axis=2)
+    to_sky = greatest(np.abs(image.astype(np.float32) - _local_mean(image, sky)))
+    to_land = greatest(np.abs(image.astype(np.float32) - _local_mean(image, ~sky)))
     return np.asarray(ring & (to_sky < 0.7 * to_land))
 
 
@@ -142,7 +144,7 @@ def _thin(
     image: NDArray[np.uint8], sky: NDArray[np.bool_], sky_colour: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
     """Posts, lamps and wires within the sky: narrow, long, of another colour."""
-    off = cv2.absdiff(image, np.rint(sky_colour).clip(0, 255).astype(np.uint8)).max(axis=2)
+    off = greatest(cv2.absdiff(image, np.rint(sky_colour).clip(0, 255).astype(np.uint8)))
     off = np.where(sky, off, 0).astype(np.uint8)
     side = 2 * max(3, round(THIN_SHARE * image.shape[1])) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))

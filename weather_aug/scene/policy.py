@@ -84,7 +84,11 @@ class WeatherPolicy:
                 raise ArgumentError(
                     f"weather type {printable(unknown[0])!r} is not one of {', '.join(TYPES)}"
                 )
-        types = {name: finite(f"weight of {name}", w, 0) for name, w in self.types.items()}
+        # Equal policies draw equally, in whatever order a file lists their types (YAML sorts them).
+        names = sorted(
+            self.types, key=lambda name: [TYPES.index(part) for part in str(name).split("+")]
+        )
+        types = {name: finite(f"weight of {name}", self.types[name], 0) for name in names}
         if not 0 < sum(types.values()) < math.inf:
             raise ArgumentError("the weights of types must sum to a finite number above 0")
         try:

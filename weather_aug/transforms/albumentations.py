@@ -1,266 +1,396 @@
-"""RandomWeather for albumentations 2.0: weather as one line of a Compose."""
+"""RandomWeather for albumentations 2.0.8 and AlbumentationsX: weather as one line of a Compose."""
 
 from __future__ import annotations
 
-import sys
-from dataclasses import asdict, fields, replace
-from typing import Any
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from weather_aug._checks import finite, image_uint8, like_image
+from weather_aug._checks import finite
 from weather_aug._extras import require
 from weather_aug._keys import key_of, uniforms
-from weather_aug.clip.prior import geometric_prior_depth
-from weather_aug.clip.types import Camera, Frame, FrameKey
-from weather_aug.edit.ambience import ambience_of
 from weather_aug.errors import ArgumentError, printable
-from weather_aug.render.compose import RenderedFrame, render
-from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
+from weather_aug.render.options import RenderOptions
 from weather_aug.scene.policy import WeatherPolicy
-from weather_aug.taxonomy import IGNORE, SKY
-from weather_aug.weather import Weather
+from weather_aug.taxonomy import IGNORE
+from weather_aug.transforms.draws import Draws, worker_seed
+from weather_aug.transforms.picture import Drawn, Weathered, Weathering
+from weather_aug.transforms.shelf import Shelf
 
 # Without it the import below would fail with no word on which extra to install.
 require("albumentations", extra="albumentations", to="use RandomWeather in a Compose")
 
 import albumentations as A  # noqa: E402
-from albumentations.core.transforms_interface import BaseTransformInitSchema  # noqa: E402
 
-UInt8 = NDArray[np.uint8]
-
-STREET_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""Street axes of a level camera whose own axes are the world's."""
-DEFAULT_FOV_DEG = 60.0
-EXPOSURE_S = 0.005
 _PICTURES = ("image", "images", "volume", "volumes")
-"""Kinds of targets that hold pictures; depth and mask belong to one picture alone."""
+"""Kinds of targets that hold pictures; depth and mask belong to one of them alone."""
+_OF_A_PICTURE = ("mask", "depth", "camera", "scene_key")
+_OF_A_STACK = ("depths", "cameras", "scene_keys")
+
+if hasattr(A.BasicTransform, "sample_parameters"):  # AlbumentationsX
+    from albumentations.core.transform_params import SampledParams
+
+    class _Host(A.DualTransform):
+        _targets = ("image", "images", "mask", "masks", "bboxes", "keypoints")
+        _supported_bbox_types = frozenset({"hbb", "obb"})
+
+        def apply_in_invocation(
+            self, invocation: Any, /, *args: Any, force_apply: bool, **data: Any
+        ) -> Any:
+            """Decide by its name whether a named sample gets weather."""
+            applied = self.decided(data, force_apply)
+            if applied is False:
+                return data
+            force_apply = force_apply or bool(applied)
+            return super().apply_in_invocation(invocation, *args, force_apply=force_apply, **data)
+
+        def sample_parameters(
+            self, params: Any, data: dict[str, Any], targets: Any, sampling: Any
+        ) -> Any:
+            """Draw weather, seed and speed: JSON values only, so that a replay can store them."""
+            return SampledParams(params=self.drawn(data, sampling.random_generator).to_dict())
+
+        def apply_with_params(self, sampled_params: Any, *args: Any, **data: Any) -> dict[str, Any]:
+            """Render what is a picture and hand on everything else as it is."""
+            return self.weathered(sampled_params.params, data)
+
+else:
+
+    class _Host(A.DualTransform):  # type: ignore[no-redef]
+        def __call__(self, *args: Any, force_apply: bool = False, **data: Any) -> Any:
+            """Decide by its name whether a named sample gets weather."""
+            applied = self.decided(data, force_apply)
+            if applied is False:
+                self.params: dict[str, Any] = {}
+                return data
+            return super().__call__(*args, force_apply=force_apply or bool(applied), **data)
+
+        def update_transform_params(
+            self, params: dict[str, Any], data: dict[str, Any]
+        ) -> dict[str, Any]:
+            """Nothing to add: what depends on the data is checked and read when it is rendered."""
+            return params
+
+        def get_params_dependent_on_data(
+            self, params: dict[str, Any], data: dict[str, Any]
+        ) -> dict[str, Any]:
+            """Draw weather, seed and speed: JSON values only, so that a replay can store them."""
+            return self.drawn(data, self.random_generator).to_dict()
+
+        def apply_with_params(
+            self, params: dict[str, Any], *args: Any, **data: Any
+        ) -> dict[str, Any]:
+            """Render what is a picture and hand on everything else as it is."""
+            return self.weathered(params, data)
 
 
-class RandomWeather(A.DualTransform):
-    """Rain, snow or fog drawn from a policy, over an image and its label mask.
+class RandomWeather(_Host):
+    """Rain, snow or fog drawn from a policy, over pictures and their label masks.
 
     Convention:
-        `image` is (H, W, 3) uint8 RGB; `mask` is (H, W) uint8 Cityscapes train ids and comes back
-        with 255 where the weather hides the surface. Only the key `mask` does: weather moves
-        nothing, so every other target (`masks`, further masks such as instance maps or depth,
-        `bboxes`, `keypoints`) passes through unchanged. A second picture is refused, because it
-        would need a depth and a camera of its own.
+        **One picture.** `image` is (H, W, 3) RGB, uint8 or float32 in [0, 1] (worked on in 8 bits);
+        `mask` is (H, W) integers and comes back with `ignore_index` where the weather hides the
+        surface. Depth and camera are those of the call where given: `depth` (H, W) float, metres
+        along the optical axis (NaN, 0 and below 0 count as far, as does `inf`; refused if unknown
+        on more than half of the pixels outside the sky), `camera` a `weather_aug.Camera`. Else
+        depth is found as `DepthSource` says, and the camera is level.
 
-        `depth` (H, W) float, metres along the optical axis, and `camera` (`weather_aug.Camera`)
-        are taken from the call where given; else depth is the geometric prior of the mask (ground
-        plane, standing objects, sky). Unknown depth (NaN, 0, below 0) counts as far, as does `inf`,
-        so complete a sparse depth first; one that is unknown on more than half of the pixels
-        outside the sky is refused. Where no mask says what is sky, `inf` is sky.
+        **One frame of a scene.** With `scenes` and a `scene_key` (see `transforms.shelf.SceneKey`)
+        the scene renders its frame, with its own depth, camera and light; `image` must be that
+        frame's picture. The mask given is marked where the scene says that its surface is hidden.
 
-        Put the transform before crops and flips: depth and camera belong to the whole picture.
-        Randomness is the transform's own generator (`Compose(seed=…)`), mixed with the DataLoader
-        worker's seed.
+        **A stack.** `images` (N, H, W, 3), or a list, are the pictures of one drive, `fps` of them
+        a second, in one weather under one light: the same drops fly on. `masks`, `depths`,
+        `cameras` and `scene_keys` then hold one for each; frames of scenes keep their own times.
+
+        Weather moves nothing: all other targets (boxes, points, further masks, and `masks` beside
+        `image`) pass through unchanged. A second picture is refused, because it would need a depth
+        of its own. Put the transform before crops and flips: depth and camera belong to the whole
+        picture.
+
+        **Randomness.** A call with a `sample_key` (an integer, a string, or a tuple of these, such
+        as (epoch, index)) gets what (seed, `set_epoch`, sample_key) decide, `p` included, in any
+        process, in any order. `seed` is an argument, because a Compose hands its transforms a
+        generator and never its seed. Two weathers in one Compose need different seeds. Without a
+        key the Compose's generator is drawn from, mixed with the DataLoader worker's seed; that
+        differs between numbers of workers. Global generators are neither read nor moved.
+
+        **Writing down.** All arguments are JSON values, or become such; `A.to_dict`, `A.save` and
+        `ReplayCompose` reproduce the picture. A `depth_network` that is a function is refused
+        there.
 
     Args:
         policy: Which weather how often, or its `to_dict` form.
         speed_m_per_s: Range of the car's speed, which leans and lengthens the streaks.
-        camera_height_m: Of the geometric prior.
-        max_particles: Budget of the renderer, instead of the one in `options`.
+        camera_height_m: Over the ground, of a camera that is not given.
+        hfov_deg: Horizontal field of view of a camera that is not given.
         options: Choices besides the weather, or their fields as a dict; effects are left out by
             name, as in `RenderOptions(without=("drops", "noise"))`.
+        max_particles: Budget of the renderer, instead of the one in `options`.
+        taxonomy: What the mask's ids mean: a name, the train class (or None) of each id, or None.
+        ignore_index: The id that hidden pixels get.
+        unknown_ids: What an id is that the taxonomy does not declare: "error" or "ignore".
+        depth_cache: Folder of depths by the picture's content.
+        depth_network: Folder or name of a `depth-estimation` model, or a function.
+        scenes: Folders of scenes for `scene_key`.
+        fps: Pictures a second of a stack.
+        seed: Of named samples.
         p: Probability of any weather.
 
     Raises:
         MissingExtraError: At import, if albumentations is not installed.
         ArgumentError: If an argument is out of range, an additional target is a picture, or at a
-            call there is no `image`, more than one picture, too little depth, or neither depth nor
-            a mask to take a prior from.
+            call there is no picture, more than one, or one that does not fit what comes with it.
+        DataError: At a call, if the mask holds an id that its taxonomy does not declare.
     """
-
-    class InitSchema(BaseTransformInitSchema):
-        """Types of the constructor's arguments."""
-
-        policy: Any
-        speed_m_per_s: tuple[float, float]
-        camera_height_m: float
-        max_particles: int | None
-        options: Any
 
     def __init__(
         self,
         policy: WeatherPolicy | dict[str, Any] | None = None,
+        *,
         speed_m_per_s: tuple[float, float] = (0.0, 15.0),
         camera_height_m: float = 1.5,
-        max_particles: int | None = None,
-        p: float = 0.5,
+        hfov_deg: float = 60.0,
         options: RenderOptions | dict[str, Any] | None = None,
+        max_particles: int | None = None,
+        taxonomy: str | Mapping[Any, str | None] | None = "train_ids",
+        ignore_index: int = IGNORE,
+        unknown_ids: Literal["error", "ignore"] = "error",
+        depth_cache: str | None = None,
+        depth_network: str | Callable[..., Any] | None = None,
+        scenes: Sequence[str | os.PathLike[str]] = (),
+        fps: float = 10.0,
+        seed: int = 0,
+        p: float = 0.5,
     ) -> None:
-        super().__init__(p=p)
-        if isinstance(policy, WeatherPolicy):
-            policy = policy.to_dict()
-        self.policy = WeatherPolicy.from_dict(policy or {}).to_dict()
-        low, high = (finite("speed_m_per_s", v, 0, 100) for v in speed_m_per_s)
-        if low > high:
-            raise ArgumentError(f"speed_m_per_s must be a range (low, high), got {speed_m_per_s}")
-        self.speed_m_per_s = (low, high)
-        self.camera_height_m = finite("camera_height_m", camera_height_m, 0.1, 100)
-        chosen = _options(options)
+        super().__init__(p=finite("p", p, 0, 1))
+        weathering = Weathering.of(
+            policy,
+            speed_m_per_s=speed_m_per_s,
+            camera_height_m=camera_height_m,
+            hfov_deg=hfov_deg,
+            options=options,
+            taxonomy=taxonomy,
+            ignore_index=ignore_index,
+            unknown_ids=unknown_ids,
+            depth_cache=depth_cache,
+            depth_network=depth_network,
+        )
         if max_particles is not None:
-            chosen = replace(chosen, max_particles=max_particles)
-        # As JSON values, so that a pipeline can be written down.
-        self.options = asdict(chosen) | {"without": list(chosen.without)}
-        self.max_particles = chosen.max_particles
+            fewer = replace(weathering.options, max_particles=max_particles)
+            weathering = replace(weathering, options=fewer)
+        self.weathering = weathering
+        self.shelf = Shelf(scenes)
+        self.fps = finite("fps", fps, 1e-3, 1e4)
+        self.draws = Draws("albumentations", seed)
 
-    def get_params(self) -> dict[str, Any]:
-        """Draw weather, seed and speed: JSON values only, so that a replay can store them."""
-        key = key_of("albumentations", int(self.random_generator.integers(2**62)), _worker_seed())
-        draw = WeatherPolicy.from_dict(self.policy).draw(key % 2**62, 0, 0)
-        low, high = self.speed_m_per_s
-        speed = low + (high - low) * float(uniforms(key, 1)[0])
-        return {"weather": draw.weather.to_dict(), "seed": draw.seed, "speed": speed}
+    def set_epoch(self, epoch: int) -> None:
+        """Draw the weather of another epoch for named samples, in this process and all workers."""
+        self.draws.set_epoch(epoch)
+
+    def decided(self, data: Mapping[str, Any], force_apply: bool) -> bool | None:
+        """Whether a named sample gets weather; None leaves that to the host."""
+        if data.get("sample_key") is None or force_apply or self.replay_mode:
+            return None
+        # Of a domain of its own, so that it says nothing about the weather.
+        key = key_of("albumentations-p", self._key(data) % 2**64)
+        return bool(uniforms(key, 1)[0] < self.p)
+
+    def drawn(self, data: Mapping[str, Any], generator: np.random.Generator) -> Drawn:
+        """Weather, seed and speed for one call."""
+        if data.get("sample_key") is not None:
+            return self.weathering.draw(self._key(data))
+        own = int(generator.integers(2**62))
+        # Albumentations 2.0.8 gives every worker the same generator.
+        return self.weathering.draw(key_of("albumentations", own, worker_seed()))
+
+    def _key(self, data: Mapping[str, Any]) -> int:
+        """The key of a named sample, which does not hang on its picture."""
+        unseen: Any = None
+        return self.draws.key(unseen, data["sample_key"])
+
+    def weathered(self, params: dict[str, Any], data: dict[str, Any]) -> dict[str, Any]:
+        """A call's data with its picture or stack in the weather of `Drawn.to_dict`."""
+        for name in ("volume", "volumes"):
+            if data.get(name) is not None:
+                raise _second_picture(name)
+        drawn = Drawn.from_dict(params)
+        if data.get("images") is None:
+            if data.get("image") is None:
+                raise ArgumentError("RandomWeather needs a picture: pass image=… (H, W, 3)")
+            return data | self._picture(drawn, data)
+        if data.get("image") is not None:
+            raise _second_picture("images")
+        return data | self._stack(drawn, data)
+
+    def _picture(self, drawn: Drawn, data: dict[str, Any]) -> dict[str, Any]:
+        image, given = data["image"], data.get("mask")
+        mask = _plane(given)
+        if data.get("scene_key") is not None:
+            done = self._of_scene(data["scene_key"], image, mask, drawn)
+        else:
+            depth, camera = _plane(data.get("depth")), data.get("camera")
+            done = self.weathering.render(image, drawn, mask=mask, depth=depth, camera=camera)
+        if done.mask is None or given is None:
+            return {"image": done.image}
+        return {"image": done.image, "mask": done.mask.reshape(given.shape)}
+
+    def _stack(self, drawn: Drawn, data: dict[str, Any]) -> dict[str, Any]:
+        for name in _OF_A_PICTURE:
+            if data.get(name) is not None:
+                raise ArgumentError(
+                    f"{name} belongs to image=…; with images give {name}s, one for each picture"
+                )
+        images, given, scene_keys = data["images"], data.get("masks"), data.get("scene_keys")
+        masks = None if given is None else [_plane(mask) for mask in given]
+        if scene_keys is None:
+            depths = data.get("depths")
+            done = self.weathering.render_stack(
+                images,
+                drawn,
+                fps=self.fps,
+                masks=masks,
+                depths=None if depths is None else [_plane(depth) for depth in depths],
+                cameras=data.get("cameras"),
+            )
+        else:
+            done = self._stack_of_scene(scene_keys, images, masks, drawn)
+        stack = {"images": _like(images, [each.image for each in done])}
+        if given is not None:
+            marked = [each.mask for each in done if each.mask is not None]
+            pairs = zip(marked, given, strict=True)
+            stack["masks"] = _like(given, [mask.reshape(own.shape) for mask, own in pairs])
+        return stack
+
+    def _stack_of_scene(
+        self,
+        scene_keys: Sequence[Any],
+        images: Sequence[NDArray[Any]],
+        masks: Sequence[NDArray[Any]] | None,
+        drawn: Drawn,
+    ) -> list[Weathered]:
+        for name, values in (("scene_keys", scene_keys), ("masks", masks)):
+            if values is not None and len(values) != len(images):
+                raise ArgumentError(
+                    f"{name} must hold one for each of {len(images)} pictures, got {len(values)}"
+                )
+        none = [None] * len(images)
+        each = zip(scene_keys, images, none if masks is None else masks, strict=True)
+        return [self._of_scene(key, image, mask, drawn) for key, image, mask in each]
+
+    def _of_scene(
+        self, scene_key: Any, image: Any, mask: NDArray[Any] | None, drawn: Drawn
+    ) -> Weathered:
+        shot = self.shelf.render(scene_key, image, drawn, self.weathering.options)
+        if mask is not None:
+            self.weathering.ids.check(mask, shot.image.shape[:2])
+        return self.weathering.handed_back(image, mask, shot)
 
     def add_targets(self, additional_targets: dict[str, str]) -> None:
         """Take further targets of a Compose; refuse pictures as soon as it is made."""
-        super().add_targets(additional_targets)
-        for name, kind in self._additional_targets.items():
+        for name, kind in additional_targets.items():
             if kind in _PICTURES:
                 raise _second_picture(name)
+        super().add_targets(additional_targets)
 
-    def update_transform_params(
-        self, params: dict[str, Any], data: dict[str, Any]
-    ) -> dict[str, Any]:
-        """Nothing to add: what depends on the data is checked and read when it is rendered."""
-        return params
+    def _set_keys(self) -> None:
+        super()._set_keys()
+        # A strict Compose refuses what no transform of it knows.
+        self._available_keys |= {*_OF_A_PICTURE, *_OF_A_STACK, "sample_key"}
 
-    def apply_with_params(
-        self, params: dict[str, Any], *args: Any, **kwargs: Any
-    ) -> dict[str, Any]:
-        """Render `image`, mark in `mask` what is hidden, and hand on everything else as it is."""
-        for name in _PICTURES[1:]:
-            if kwargs.get(name) is not None:
-                raise _second_picture(name)
-        if kwargs.get("image") is None:
-            raise ArgumentError("RandomWeather needs a picture: pass image=… (H, W, 3) uint8")
-        shot = self._render(params, kwargs)
-        done = kwargs | {"image": shot.image}
-        if shot.label is not None:
-            done["mask"] = np.where(shot.label != shot.label_full, IGNORE, kwargs["mask"])
-        return done
+    def get_transform_init_args(self) -> dict[str, Any]:
+        """The constructor's arguments besides `p`, as JSON values."""
+        depth = self.weathering.depth
+        plain = replace(self.weathering, depth=replace(depth, network=None)).to_dict()
+        own = {"scenes": list(self.shelf.paths), "fps": self.fps, "seed": self.draws.seed}
+        return plain | {"depth_network": depth.network} | own
 
-    def _render(self, params: dict[str, Any], data: dict[str, Any]) -> RenderedFrame:
-        image = image_uint8("image", data["image"])
-        label = _label(data.get("mask"), image.shape[:2])
-        camera = data.get("camera") or default_camera(image.shape[:2], params["speed"])
-        depth = self._depth(data.get("depth"), label, camera)
-        frame = Frame(FrameKey(0, "image"), 0.0, camera, image, label, depth)
-        return render(
-            frame,
-            Weather.from_dict(params["weather"]),
-            seed=params["seed"],
-            ambience=ambience_of(frame, STREET_AXES @ camera.world_from_camera[:3, :3].T),
-            options=_options(self.options),
-        )
+    def to_dict_private(self) -> dict[str, Any]:
+        """What `A.to_dict` writes down.
 
-    def _depth(self, depth: Any, label: UInt8 | None, camera: Camera) -> NDArray[Any]:
-        if depth is not None:
-            depth = np.asarray(depth)
-            like_image("depth", depth, (camera.height, camera.width))
-            _check_known(depth, label)
-            return depth
-        if label is None:
-            raise ArgumentError(
-                "RandomWeather needs depth to know what is far: pass depth=… (metres), or a mask "
-                "of train ids to take a geometric prior from"
-            )
-        return geometric_prior_depth(
-            label,
-            focal_px=camera.focal_px[1],
-            principal_px=camera.principal_px,
-            camera_height_m=self.camera_height_m,
-        )
+        Raises:
+            ArgumentError: If depth comes from a function.
+        """
+        self.weathering.to_dict()
+        return super().to_dict_private()
 
 
-def default_camera(shape: tuple[int, int], speed_m_per_s: float) -> Camera:
-    """A level camera of 60 degrees that drives forward, for pictures that come without one."""
-    height, width = shape
-    focal_px = 0.5 * width / np.tan(np.radians(DEFAULT_FOV_DEG / 2))
-    intrinsics = np.array(
-        [[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]]
-    )
-    return Camera(
-        intrinsics,
-        np.eye(4),
-        width,
-        height,
-        exposure_s=EXPOSURE_S,
-        velocity_m_per_s=np.array([0.0, 0.0, speed_m_per_s]),
-    )
+class RandomRain(RandomWeather):
+    """Rain alone, of a rate in a range.
 
-
-def _options(options: Any) -> RenderOptions:
-    if options is None:
-        return DEFAULT_OPTIONS
-    if isinstance(options, RenderOptions):
-        return options
-    if not isinstance(options, dict):
-        raise ArgumentError(
-            f"options must be RenderOptions, or a dict of its fields, got {type(options).__name__}"
-        )
-    known = [field.name for field in fields(RenderOptions)]
-    unknown = sorted(set(options) - set(known), key=str)
-    if unknown:
-        raise ArgumentError(
-            f"RenderOptions has no field {printable(unknown[0])}; it has {', '.join(known)}"
-        )
-    return RenderOptions(**options)
-
-
-def _worker_seed() -> int:
-    """Seed of this DataLoader worker, 0 outside one.
-
-    Albumentations 2.0.8 gives every worker the same generator; without this, two workers draw the
-    same weather.
+    Args:
+        mm_per_h: Range of rates, mm/h; see `WeatherPolicy.rain`.
+        how: As `RandomWeather` takes, besides `policy`.
     """
-    torch = sys.modules.get("torch")
-    info = torch.utils.data.get_worker_info() if torch is not None else None
-    return 0 if info is None else int(info.seed)
+
+    def __init__(self, mm_per_h: tuple[float, float] = (1.5, 75.0), **how: Any) -> None:
+        super().__init__(WeatherPolicy.rain(mm_per_h), **how)
+        self.mm_per_h = tuple(mm_per_h)
+
+    def get_transform_init_args(self) -> dict[str, Any]:
+        """The constructor's arguments besides `p`, as JSON values."""
+        return _in_units(super().get_transform_init_args(), mm_per_h=self.mm_per_h)
+
+
+class RandomSnow(RandomWeather):
+    """Snow alone, of a rate in a range.
+
+    Args:
+        mm_per_h: Range of rates, mm/h of water; see `WeatherPolicy.snow`.
+        how: As `RandomWeather` takes, besides `policy`.
+    """
+
+    def __init__(self, mm_per_h: tuple[float, float] = (0.4, 4.0), **how: Any) -> None:
+        super().__init__(WeatherPolicy.snow(mm_per_h), **how)
+        self.mm_per_h = tuple(mm_per_h)
+
+    def get_transform_init_args(self) -> dict[str, Any]:
+        """The constructor's arguments besides `p`, as JSON values."""
+        return _in_units(super().get_transform_init_args(), mm_per_h=self.mm_per_h)
+
+
+class RandomFog(RandomWeather):
+    """Fog alone, of a visibility in a range.
+
+    Args:
+        visibility_m: Range of meteorological optical ranges, m; see `WeatherPolicy.fog`.
+        how: As `RandomWeather` takes, besides `policy`.
+    """
+
+    def __init__(self, visibility_m: tuple[float, float] = (50.0, 600.0), **how: Any) -> None:
+        super().__init__(WeatherPolicy.fog(visibility_m), **how)
+        self.visibility_m = tuple(visibility_m)
+
+    def get_transform_init_args(self) -> dict[str, Any]:
+        """The constructor's arguments besides `p`, as JSON values."""
+        return _in_units(super().get_transform_init_args(), visibility_m=self.visibility_m)
+
+
+def _in_units(how: dict[str, Any], **units: tuple[float, ...]) -> dict[str, Any]:
+    """Arguments with a range in place of the policy that follows from it."""
+    others = {name: value for name, value in how.items() if name != "policy"}
+    return {name: [float(end) for end in ends] for name, ends in units.items()} | others
+
+
+def _plane(array: Any) -> Any:
+    """(H, W) of a plane that AlbumentationsX, or a caller, gave a last axis of one channel."""
+    channelled = isinstance(array, np.ndarray) and array.ndim == 3 and array.shape[2] == 1
+    return array[..., 0] if channelled else array
+
+
+def _like(given: Any, done: list[Any]) -> Any:
+    """A stack in the container in which it came."""
+    if not isinstance(given, np.ndarray):
+        return done
+    return np.stack(done) if done else given.copy()
 
 
 def _second_picture(name: str) -> ArgumentError:
     return ArgumentError(
-        f"RandomWeather weathers the target image alone, and {printable(name)!r} is another "
-        "picture: call the pipeline once for each picture, or declare what is no picture as 'mask'"
+        f"RandomWeather weathers one target, image or images, and {printable(name)!r} is another "
+        "picture: call the pipeline once for each, or declare what is no picture as 'mask'"
     )
-
-
-def _check_known(depth: NDArray[Any], label: UInt8 | None) -> None:
-    """Refuse a depth that is mostly holes, which the renderer would silently take for far."""
-    if depth.dtype.kind != "f":
-        raise ArgumentError(f"depth must be a float array in metres, got {depth.dtype}")
-    known = np.isfinite(depth) & (depth > 0)
-    surface = np.ones(depth.shape, bool) if label is None else label != SKY
-    open_sky = depth == np.inf
-    if label is not None:
-        open_sky &= label == IGNORE
-    expected = int(np.count_nonzero(surface & ~open_sky))
-    found = int(np.count_nonzero(surface & known))
-    if surface.any() and (found == 0 or 2 * found < expected):
-        raise ArgumentError(
-            f"depth is known (finite and above 0) on {found / max(expected, 1):.0%} of the pixels "
-            "outside the sky, and unknown depth counts as far: complete the depth first, or leave "
-            "it out to take a geometric prior from the mask"
-        )
-
-
-def _label(mask: Any, shape: tuple[int, int]) -> UInt8 | None:
-    if mask is None:
-        return None
-    if not isinstance(mask, np.ndarray):
-        raise ArgumentError(f"mask must be a numpy array, got {type(mask).__name__}")
-    like_image("mask", mask, shape)
-    if not np.can_cast(np.uint8, mask.dtype) or mask.dtype.kind not in "iu":
-        raise ArgumentError(f"mask must be an integer array that holds 0..255, got {mask.dtype}")
-    low, high = int(mask.min()), int(mask.max())
-    if low < 0 or high > 255:
-        raise ArgumentError(
-            f"mask must hold train ids in 0..255, found {low if low < 0 else high}; map its ids "
-            "to train ids first"
-        )
-    return np.ascontiguousarray(mask, dtype=np.uint8)

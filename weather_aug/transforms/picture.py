@@ -245,10 +245,14 @@ class Weathering:
         """A rendered picture and its mask in the types in which they came."""
         done: NDArray[Any] = shot.image
         if image.dtype != np.uint8:
-            done = (shot.image / np.float32(255)).astype(np.float32)
+            # What the weather leaves alone keeps its finer value.
+            same = shot.image == shot.frame.image
+            done = np.where(same, image, shot.image / np.float32(255)).astype(np.float32)
         if mask is None:
             return Weathered(done, None, shot)
-        if shot.label is None or shot.label_full is None:
+        if self.options.labels == "keep":
+            hidden = np.zeros(shot.invalid.shape, bool)
+        elif shot.label is None or shot.label_full is None:
             hidden = shot.invalid != 0
         else:
             hidden = (shot.label == IGNORE) & (shot.label != shot.label_full)

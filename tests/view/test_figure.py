@@ -344,10 +344,10 @@ def test_without_matplotlib_the_cure_is_named(
     ("weather", "says"),
     [
         (Weather.clear(), "clear"),
-        (Weather.rain(mm_per_h=123.4), "123 mm/h"),
+        (Weather.rain(mm_per_h=123.4), "120 mm/h"),
         (Weather.rain(mm_per_h=0.456), "0.46 mm/h"),
         (Weather.snow("heavy"), "2 mm/h of water"),
-        (Weather.fog(visibility_m=1234.5), "visibility 1234 m"),
+        (Weather.fog(visibility_m=1234.5), "visibility 1200 m"),
         (Weather.mix(Weather.rain("light"), Weather.fog("heavy")), "1.5 mm/h, visibility 150 m"),
         (Weather.snow("heavy", falling=False), "snow on the ground"),
         (Weather.rain("heavy", falling=False), "wet ground"),

@@ -75,17 +75,15 @@ class MaskIds:
         self.check(mask, shape)
         if self._table is None:
             return None
-        known = np.where(mask == self.ignore_index, IGNORE, mask)
         table = self._table
+        ignored = mask == self.ignore_index
         if self.unknown_ids == "ignore":
-            declared = np.isin(known, [*table.class_by_id])
-            known = np.where(declared, known, IGNORE)
-        if IGNORE in table.class_by_id:
-            return table.train_ids(known, where="mask")
-        # A taxonomy may know no 255; the caller's ignored pixels have none of its classes.
-        ignored = known == IGNORE
+            ignored |= ~np.isin(mask, [*table.class_by_id])
+        elif IGNORE not in table.class_by_id:
+            ignored |= mask == IGNORE
+        # 255 may be a class of the caller's, so no id can stand for what is ignored.
         first = next(iter(table.class_by_id))
-        ids = table.train_ids(np.where(ignored, first, known), where="mask")
+        ids = table.train_ids(np.where(ignored, first, mask), where="mask")
         ids[ignored] = IGNORE
         return ids
 
@@ -128,6 +126,8 @@ class MaskIds:
 
 def _by_id(names: Mapping[Any, Any]) -> dict[int, str | None]:
     """A mapping by integer id; JSON has made strings of its keys."""
+    if not names:
+        raise ArgumentError("taxonomy must map at least one id; None says that ids are no classes")
     try:
         return {int(index): name for index, name in names.items()}
     except (TypeError, ValueError):

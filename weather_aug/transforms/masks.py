@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from weather_aug._checks import like_image
 from weather_aug._keys import check_seed
 from weather_aug.errors import ArgumentError, printable
+from weather_aug.render.options import LabelPolicy
 from weather_aug.taxonomy import IGNORE, Taxonomy, taxonomy
 
 UInt8 = NDArray[np.uint8]
@@ -122,6 +123,25 @@ class MaskIds:
             "ignore_index": self.ignore_index,
             "unknown_ids": self.unknown_ids,
         }
+
+
+def hidden_in(label: Any, full: Any, invalid: Any, policy: LabelPolicy) -> Any:
+    """Where a mask is marked: bool, of the shape of numpy arrays or tensors of any one kind.
+
+    Pixels of no train class count as hidden where they cannot be made out: the caller may train on
+    their ids.
+
+    Args:
+        label: Train ids in the weather; None where there is no label.
+        full: Train ids of the clear picture, or None.
+        invalid: 1 where the surface cannot be made out.
+        policy: See `RenderOptions.labels`.
+    """
+    told = (invalid != 0) & (policy != "keep")
+    if label is None or full is None:
+        return told
+    classless = full == IGNORE
+    return ((label == IGNORE) & ~classless) | (told & classless & (policy == "ignore_unseen"))
 
 
 def _by_id(names: Mapping[Any, Any]) -> dict[int, str | None]:

@@ -185,8 +185,6 @@ class RandomWeather(v2.Transform):
         done = []
         for image, mask, key in zip(sample.pixels, masks, keys, strict=True):
             shot = self.shelf.render(key, image, drawn, self.weathering.options)
-            if mask is not None:
-                self.weathering.ids.check(mask, image.shape[:2])
             done.append(self.weathering.handed_back(image, mask, shot))
         return done
 

@@ -14,9 +14,9 @@ from weather_aug.air import air_of
 from weather_aug.clip.types import Camera, Frame, FrameKey
 from weather_aug.errors import ArgumentError
 from weather_aug.render import compose
-from weather_aug.render.options import RenderOptions
+from weather_aug.render.options import LabelPolicy, RenderOptions
 from weather_aug.scene.policy import WeatherPolicy
-from weather_aug.taxonomy import IGNORE, SKY
+from weather_aug.taxonomy import CLASSES, IGNORE, ROAD, SKY
 from weather_aug.transforms import picture
 from weather_aug.transforms.picture import Drawn, Weathering, default_camera, light_of, rgb_uint8
 from weather_aug.weather import Weather
@@ -78,6 +78,22 @@ def test_clear_weather_is_the_picture_itself(frame: Frame) -> None:
     assert (CLEAR.render(fine, CLEAR.draw(1), mask=frame.label).image == fine).all()
 
 
+@pytest.mark.parametrize("labels", ["ignore_unseen", "acdc", "keep"])
+def test_ids_without_a_train_class_are_hidden_too(frame: Frame, labels: LabelPolicy) -> None:
+    """The caller may train on more ids than have a train class."""
+    names = {index: None if index == ROAD else name for index, name in enumerate(CLASSES)}
+    own = Weathering.of(
+        FOG.policy, taxonomy=names | {IGNORE: None}, options=RenderOptions(labels=labels)
+    )
+    done = own.render(frame.image, FOG.draw(1), mask=frame.label, depth=frame.depth_m)
+    assert done.mask is not None
+    classless = frame.label == ROAD
+    unreadable = classless & (done.shot.invalid != 0)
+    assert 0 < unreadable.sum() < classless.sum()
+    expected = unreadable if labels == "ignore_unseen" else np.zeros_like(unreadable)
+    assert ((done.mask == IGNORE)[classless] == expected[classless]).all()
+
+
 @pytest.mark.parametrize("taxonomy", ["train_ids", None])
 def test_labels_that_are_kept_are_kept(frame: Frame, taxonomy: str | None) -> None:
     keep = Weathering.of(FOG.policy, options=RenderOptions(labels="keep"), taxonomy=taxonomy)
@@ -137,6 +153,18 @@ def test_a_stack_is_each_picture_at_its_time_under_one_light() -> None:
     # The air drifts on, too: equal pictures at other times differ.
     assert air_of(drawn.weather, 0.1, drawn.seed) != air_of(drawn.weather, 0.0, drawn.seed)
     assert (done[0].image != done[1].image).any()
+
+
+@pytest.mark.parametrize("name", ["masks", "depths", "cameras"])
+def test_a_stack_takes_sequences(name: str) -> None:
+    with pytest.raises(ArgumentError, match=f"{name} must be a sequence, got int"):
+        SNOW.render_stack(stack_of(2)[0], SNOW.draw(5), fps=10, **{name: 5})
+
+
+def test_what_is_no_camera_is_refused(frame: Frame) -> None:
+    camera: Any = {"fx": 500}
+    with pytest.raises(ArgumentError, match="camera must be a Camera, got dict"):
+        SNOW.render(frame.image, SNOW.draw(1), camera=camera)
 
 
 def test_a_light_for_each_picture_would_be_seen() -> None:

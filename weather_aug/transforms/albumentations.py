@@ -245,6 +245,11 @@ class RandomWeather(_Host):
                 raise ArgumentError(
                     f"{name} belongs to image=…; with images give {name}s, one for each picture"
                 )
+        for name in ("images", "masks", *_OF_A_STACK):
+            if not isinstance(data.get(name), Sequence | np.ndarray | None):
+                raise ArgumentError(
+                    f"{name} must be a list or an array, got {type(data[name]).__name__}"
+                )
         images, given, scene_keys = data["images"], data.get("masks"), data.get("scene_keys")
         masks = None if given is None else [_plane(mask) for mask in given]
         if scene_keys is None:
@@ -286,8 +291,6 @@ class RandomWeather(_Host):
         self, scene_key: Any, image: Any, mask: NDArray[Any] | None, drawn: Drawn
     ) -> Weathered:
         shot = self.shelf.render(scene_key, image, drawn, self.weathering.options)
-        if mask is not None:
-            self.weathering.ids.check(mask, shot.image.shape[:2])
         return self.weathering.handed_back(image, mask, shot)
 
     def add_targets(self, additional_targets: dict[str, str]) -> None:

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from typing import Any, get_args
 
 from weather_aug._keys import check_seed
+from weather_aug.clip.depth_sources import DepthSource
 from weather_aug.clip.types import FrameKey
 from weather_aug.errors import ArgumentError
+from weather_aug.render.options import RenderOptions
 from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.scene.viewpoint import ViewpointJitter
 from weather_aug.transforms.curriculum import SeverityCurriculum
@@ -29,6 +31,17 @@ def checked_policy(policy: Any) -> WeatherPolicy:
             'WeatherPolicy(types={"rain": 1, …}), or WeatherPolicy.from_dict(…) of a to_dict form'
         )
     return policy
+
+
+def check_kinds(options: Any, depth: Any) -> None:
+    """Refuse options and sources of depth that are none."""
+    if not isinstance(options, RenderOptions):
+        raise ArgumentError(f"options must be RenderOptions, got {type(options).__name__}")
+    if not isinstance(depth, DepthSource | None):
+        raise ArgumentError(
+            f"depth must be a DepthSource, got {type(depth).__name__}; write "
+            "DepthSource(cache=..., network=...)"
+        )
 
 
 def checked_length(length: Any) -> int:

@@ -38,6 +38,7 @@ from weather_aug.transforms.kornia_tensors import (
     unit_range,
     whole_ids,
 )
+from weather_aug.transforms.masks import hidden_in
 from weather_aug.transforms.picture import (
     CAMERA,
     Weathering,
@@ -250,6 +251,12 @@ class RandomWeather(K.IntensityAugmentationBase2D):
         depths = None if depth is None else planes("depth", depth, count, shape)
         if cameras is not None:
             given = one_each("cameras", cameras, Camera, count, optional=True)
+            for each in given:
+                if each is not None and (each.height, each.width) != shape:
+                    raise ArgumentError(
+                        f"cameras must be of the pictures' size {shape}, got "
+                        f"{(each.height, each.width)}: put RandomWeather before crops and resizing"
+                    )
             params["camera"] = camera_rows(given)
         if "depth" not in params:
             params["depth"] = images.new_full(plane, torch.nan, dtype=torch.float32)
@@ -284,11 +291,9 @@ class RandomWeather(K.IntensityAugmentationBase2D):
         index = torch.tensor(rows, device=input.device)
         labels = params["label"][index, 0] if "label" in params else None
         shots = self._rendered(unit_range(input[index]), labels, params, rows)
-        if labels is not None and shots.label is not None:
-            hidden = (shots.label == IGNORE) & (labels != IGNORE)
-        else:
-            hidden = (shots.invalid != 0) & (self.weathering.options.labels != "keep")
-        params["hidden"][index, 0] = hidden
+        params["hidden"][index, 0] = hidden_in(
+            shots.label, labels, shots.invalid, self.weathering.options.labels
+        )
         params["transmittance"][index, 0] = shots.transmittance.detach().float()
         return input.index_copy(0, index, shots.image)
 

@@ -19,7 +19,7 @@ from weather_aug.render.compose import RenderedFrame, render
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.taxonomy import IGNORE, SKY
-from weather_aug.transforms.masks import MaskIds
+from weather_aug.transforms.masks import MaskIds, hidden_in
 from weather_aug.weather import Weather
 
 UInt8 = NDArray[np.uint8]
@@ -233,6 +233,8 @@ class Weathering:
         label = None if mask is None else self.ids.train_ids(mask, shape)
         if camera is None:
             camera = self._camera(shape, drawn.speed_m_per_s, time_s)
+        elif not isinstance(camera, Camera):
+            raise ArgumentError(f"camera must be a Camera, got {type(camera).__name__}")
         if depth is None:
             depth = self.depth.depth_m(picture, label, camera, self.camera_height_m)
         else:
@@ -242,7 +244,11 @@ class Weathering:
     def handed_back(
         self, image: NDArray[Any], mask: NDArray[Any] | None, shot: RenderedFrame
     ) -> Weathered:
-        """A rendered picture and its mask in the types in which they came."""
+        """A rendered picture and its mask in the types in which they came.
+
+        Raises:
+            ArgumentError: If the mask is of another type or size than the picture's.
+        """
         done: NDArray[Any] = shot.image
         if image.dtype != np.uint8:
             # What the weather leaves alone keeps its finer value.
@@ -250,12 +256,8 @@ class Weathering:
             done = np.where(same, image, shot.image / np.float32(255)).astype(np.float32)
         if mask is None:
             return Weathered(done, None, shot)
-        if self.options.labels == "keep":
-            hidden = np.zeros(shot.invalid.shape, bool)
-        elif shot.label is None or shot.label_full is None:
-            hidden = shot.invalid != 0
-        else:
-            hidden = (shot.label == IGNORE) & (shot.label != shot.label_full)
+        self.ids.check(mask, shot.image.shape[:2])
+        hidden = hidden_in(shot.label, shot.label_full, shot.invalid, self.options.labels)
         return Weathered(done, self.ids.marked(mask, hidden), shot)
 
     def _rendered(self, frame: Frame, drawn: Drawn, light: Ambience) -> RenderedFrame:
@@ -271,6 +273,8 @@ class Weathering:
 
 
 def _one_each(name: str, values: Any, count: int) -> list[Any]:
+    if not isinstance(values, Sequence | np.ndarray | None):
+        raise ArgumentError(f"{name}s must be a sequence, got {type(values).__name__}")
     found = [None] * count if values is None else list(values)
     if len(found) != count:
         raise ArgumentError(f"{name}s must hold one for each of {count} pictures, got {len(found)}")

@@ -155,7 +155,7 @@ class RandomWeather(v2.Transform):
             return {"picture": None, "mask": None}
         done = self._weathered(sample, self.weathering.draw(key))
         return {
-            "picture": _picture_like(sample.picture, [each.image for each in done]),
+            "picture": _picture_like(sample.picture, done),
             "mask": _mask_like(sample.mask, [each.mask for each in done]),
         }
 
@@ -185,8 +185,6 @@ class RandomWeather(v2.Transform):
         done = []
         for image, mask, key in zip(sample.pixels, masks, keys, strict=True):
             shot = self.shelf.render(key, image, drawn, self.weathering.options)
-            if mask is not None:
-                self.weathering.ids.check(mask, image.shape[:2])
             done.append(self.weathering.handed_back(image, mask, shot))
         return done
 
@@ -327,7 +325,8 @@ def _float32(depth: torch.Tensor) -> torch.Tensor:
     return depth.float() if depth.is_floating_point() else depth
 
 
-def _picture_like(given: Any, images: list[NDArray[Any]]) -> Any:
+def _picture_like(given: Any, weathered: list[Weathered]) -> Any:
+    images = [each.image for each in weathered]
     if isinstance(given, PIL.Image.Image):
         return PIL.Image.fromarray(images[0])
     height, width, _ = images[0].shape
@@ -336,6 +335,11 @@ def _picture_like(given: Any, images: list[NDArray[Any]]) -> Any:
         place[...] = image.transpose(2, 0, 1)
     # torchvision's own steps between 8 bits and [0, 1], which differ from others in the last bit.
     scaled = v2.functional.to_dtype(torch.from_numpy(done), given.dtype, scale=True)
+    if given.is_floating_point():
+        # What the weather leaves alone keeps its finer value.
+        same = np.stack([each.image == each.shot.frame.image for each in weathered])
+        own = given.detach().as_subclass(torch.Tensor).cpu().reshape(scaled.shape)
+        scaled = torch.where(torch.from_numpy(same).movedim(-1, 1), own, scaled).contiguous()
     return _like(given, scaled)
 
 

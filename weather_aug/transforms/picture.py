@@ -306,9 +306,12 @@ def rgb_uint8(image: Any) -> UInt8:
         ArgumentError: If it is no numpy array of such a shape, type and range.
     """
     if not isinstance(image, np.ndarray):
-        raise ArgumentError(f"image must be a numpy array, got {type(image).__name__}")
+        raise ArgumentError(
+            f"image must be a numpy array (H, W, 3), got {type(image).__name__}; weather comes "
+            "before conversion to tensors, and np.asarray makes an array of a PIL picture"
+        )
     if image.ndim != 3 or image.shape[2] != 3:
-        raise ArgumentError(f"image must have shape (H, W, 3), got {image.shape}")
+        raise ArgumentError(f"image must have shape (H, W, 3), got {image.shape}{_cure(image)}")
     height, width, _ = image.shape
     if height == 0 or width == 0:
         raise ArgumentError(f"image has a zero side: {image.shape}")
@@ -317,14 +320,31 @@ def rgb_uint8(image: Any) -> UInt8:
     if image.dtype == np.uint8:
         return np.ascontiguousarray(image)
     if image.dtype.newbyteorder("=") != np.float32:
-        raise ArgumentError(f"image must be uint8, or float32 in [0, 1], got {image.dtype}")
+        raise ArgumentError(
+            f"image must be uint8, or float32 in [0, 1], got {image.dtype}; convert it with "
+            "image.astype"
+        )
     low, high = float(image.min()), float(image.max())
     if not (low >= -1e-6 and high <= 1 + 1e-6):
-        raise ArgumentError(
-            f"image must be finite and in [0, 1], got [{low:g}, {high:g}]; weather comes before "
-            "normalisation"
+        bytes_as_floats = low >= 0 and 2 < high <= 255
+        cure = (
+            "divide it by 255, or keep uint8"
+            if bytes_as_floats
+            else "weather comes before normalisation"
         )
+        raise ArgumentError(f"image must be finite and in [0, 1], got [{low:g}, {high:g}]; {cure}")
     return np.ascontiguousarray(np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8))
+
+
+def _cure(image: NDArray[Any]) -> str:
+    """What makes (H, W, 3) of another shape, where that is known."""
+    if image.ndim == 3 and image.shape[0] == 3:
+        return ": move its channels last with image.transpose(1, 2, 0)"
+    if image.ndim == 3 and image.shape[2] == 4:
+        return ": leave its alpha out with image[..., :3]"
+    if image.ndim == 2 or image.shape[2:] == (1,):
+        return ": read it in colour, or repeat its channel three times"
+    return ""
 
 
 def given_depth(depth: Any, shape: tuple[int, int], label: UInt8 | None) -> NDArray[Any]:
@@ -365,7 +385,12 @@ def checked_policy(policy: Any) -> WeatherPolicy:
     """
     if isinstance(policy, WeatherPolicy):
         return policy
-    return WeatherPolicy.from_dict({} if policy is None else policy)
+    if not isinstance(policy, dict | None):
+        raise ArgumentError(
+            "policy must be a WeatherPolicy, or its fields as a dict, got "
+            f"{type(policy).__name__}; write WeatherPolicy(types={{'rain': 1, 'clear': 1}})"
+        )
+    return WeatherPolicy.from_dict(policy or {})
 
 
 def checked_options(options: Any) -> RenderOptions:

@@ -110,6 +110,6 @@ def source_of(
     if not isinstance(shown, WeatherScene):
         raise ArgumentError(
             "source must be a WeatherScene, its folder, or an (H, W, 3) picture, got "
-            f"{type(shown).__name__}"
+            f"{type(shown).__name__}; of a clip show one picture: clip.frame(key).image"
         )
     return SceneSource(shown, checked_options(options))

@@ -613,7 +613,7 @@ REFUSED: dict[str, tuple[Callable[[Any, Any], Any], str]] = {
         lambda i, m: (PIL.Image.fromarray(m.numpy()), m),
         r"mode L; convert it with image.convert\('RGB'\)",
     ),
-    "doubles": (lambda i, m: (i.double() / 255, m), "got torch.float64"),
+    "doubles": (lambda i, m: (i.double() / 255, m), r"got torch.float64; put v2.ToDtype\("),
     "halves": (lambda i, m: (i.half() / 255, m), "got torch.float16"),
     "normalised": (lambda i, m: (i.float() / 255 - 0.5, m), "before normalisation"),
     "0..255": (lambda i, m: (i.float(), m), r"in \[0, 1\]"),

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from tiny_clip import TinyClip
 
 from weather_aug.air import air_of
@@ -18,7 +19,8 @@ from weather_aug.render.options import LabelPolicy, RenderOptions
 from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.taxonomy import CLASSES, IGNORE, ROAD, SKY
 from weather_aug.transforms import picture
-from weather_aug.transforms.picture import Drawn, Weathering, default_camera, light_of, rgb_uint8
+from weather_aug.transforms.given import rgb_uint8
+from weather_aug.transforms.picture import Drawn, Weathering, default_camera, light_of
 from weather_aug.weather import Weather
 
 FOG = Weathering.of(WeatherPolicy.fog((40, 60)))
@@ -206,7 +208,8 @@ def test_the_default_camera_sees_as_wide_as_it_is_told() -> None:
     ("arguments", "says"),
     [
         ({"policy": {"types": {"hail": 1}}}, "hail"),
-        ({"policy": "rain"}, "WeatherPolicy is read from an object"),
+        ({"policy": "rain"}, r"policy must be a WeatherPolicy, .* got str; write WeatherPolicy\("),
+        ({"policy": Weather.fog("heavy")}, "policy must be a WeatherPolicy, .* got Weather;"),
         ({"speed_m_per_s": 5}, "speed_m_per_s must be a range"),
         ({"speed_m_per_s": (9, 3)}, "speed_m_per_s must be a range"),
         ({"speed_m_per_s": (0, 1000)}, "speed_m_per_s"),
@@ -222,6 +225,26 @@ def test_the_default_camera_sees_as_wide_as_it_is_told() -> None:
 def test_bad_choices_are_refused_at_once(arguments: dict[str, Any], says: str) -> None:
     with pytest.raises(ArgumentError, match=says):
         Weathering.of(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("image", "says"),
+    [
+        (torch.zeros(3, 8, 9), "got Tensor; weather comes before conversion to tensors"),
+        (np.zeros((3, 8, 9), np.uint8), r"got \(3, 8, 9\): move .* image.transpose\(1, 2, 0\)"),
+        (np.zeros((8, 9, 4), np.uint8), "got .*: leave its alpha out"),
+        (np.zeros((8, 9), np.uint8), "got .*: read it in colour"),
+        (np.zeros((8, 9, 5), np.uint8), r"got \(8, 9, 5\)$"),
+        (np.zeros((8, 9, 3)), "got float64; convert it with image.astype"),
+        (np.full((8, 9, 3), 200, np.float32), "divide it by 255, or keep uint8"),
+        (np.full((8, 9, 3), -1.5, np.float32), "weather comes before normalisation"),
+        (np.full((8, 9, 3), np.nan, np.float32), "weather comes before normalisation"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_refused_picture_is_told_its_cure(image: Any, says: str) -> None:
+    with pytest.raises(ArgumentError, match=says):
+        rgb_uint8(image)
 
 
 def test_a_camera_that_is_given_is_used(frame: Frame) -> None:

@@ -64,6 +64,9 @@ else:
         def __call__(self, *args: Any, force_apply: bool = False, **data: Any) -> Any:
             """Decide by its name whether a named sample gets weather."""
             applied = self.decided(data, force_apply)
+            if applied is None and not (force_apply or self.replay_mode) and worker_seed():
+                # Its workers would all decide alike.
+                applied = self.gate(int(self.random_generator.integers(2**62)), worker_seed())
             if applied is False:
                 self.params: dict[str, Any] = {}
                 return data
@@ -196,9 +199,11 @@ class RandomWeather(_Host):
         """Whether a named sample gets weather; None leaves that to the host."""
         if data.get("sample_key") is None or force_apply or self.replay_mode:
             return None
-        # Of a domain of its own, so that it says nothing about the weather.
-        key = key_of("albumentations-p", self._key(data) % 2**64)
-        return bool(uniforms(key, 1)[0] < self.p)
+        return self.gate(self._key(data) % 2**64)
+
+    def gate(self, *fields: int) -> bool:
+        """Whether there is weather; of a domain of its own, so that it says nothing about it."""
+        return bool(uniforms(key_of("albumentations-p", *fields), 1)[0] < self.p)
 
     def drawn(self, data: Mapping[str, Any], generator: np.random.Generator) -> Drawn:
         """Weather, seed and speed for one call."""

@@ -78,8 +78,10 @@ def check_crop(crop: Any, known: KnownFrames) -> None:
     if crop is None:
         return
     pair = isinstance(crop, tuple | list) and len(crop) == 2
-    if not pair or not all(isinstance(side, int) for side in crop):
-        raise ArgumentError(f"crop must be (height, width) in pixels, got {crop!r}")
+    if not pair or not all(isinstance(side, int) and side > 0 for side in crop):
+        raise ArgumentError(
+            f"crop must be (height, width) in pixels, as crop=(256, 512), got {crop!r}"
+        )
     for source, frame in known:
         check_fits(tuple(crop), source, frame.key, frame.size)
 
@@ -88,7 +90,8 @@ def check_fits(crop: tuple[int, ...], source: Source, key: FrameKey, size: tuple
     """Refuse a crop that is larger than a frame."""
     if not (0 < crop[0] <= size[0] and 0 < crop[1] <= size[1]):
         raise ArgumentError(
-            f"crop {tuple(crop)} does not fit frame {key} of {source} ({size[0]}x{size[1]} pixels)"
+            f"crop {tuple(crop)} does not fit frame {key} of {source} ({size[0]}x{size[1]} "
+            "pixels); choose one that fits all frames"
         )
 
 

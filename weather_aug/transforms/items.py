@@ -16,7 +16,7 @@ from weather_aug.render.compose import RenderedFrame
 from weather_aug.render.options import RenderOptions
 from weather_aug.scene.policy import WeatherDraw
 from weather_aug.scene.viewpoint import Viewpoint
-from weather_aug.transforms.picture import checked_options
+from weather_aug.transforms.given import checked_options
 from weather_aug.transforms.sources import Opened
 from weather_aug.weather import Weather
 

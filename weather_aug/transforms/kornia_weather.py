@@ -21,6 +21,7 @@ from weather_aug.render.batch_checks import BATCH_OPTIONS, check_options, one_ea
 from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.taxonomy import IGNORE
 from weather_aug.transforms.draws import Draws
+from weather_aug.transforms.given import rgb_uint8
 from weather_aug.transforms.kornia_params import (
     Params,
     camera_of,
@@ -39,13 +40,7 @@ from weather_aug.transforms.kornia_tensors import (
     whole_ids,
 )
 from weather_aug.transforms.masks import hidden_in
-from weather_aug.transforms.picture import (
-    CAMERA,
-    Weathering,
-    default_camera,
-    light_of,
-    rgb_uint8,
-)
+from weather_aug.transforms.picture import CAMERA, Weathering, default_camera, light_of
 
 # Without it the import below would fail with no word on which extra to install.
 require("kornia", extra="kornia", to="use RandomWeather on batches")

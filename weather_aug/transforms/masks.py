@@ -96,10 +96,18 @@ class MaskIds:
         """
         if not isinstance(mask, np.ndarray):
             raise ArgumentError(f"mask must be a numpy array, got {type(mask).__name__}")
+        if mask.shape == (*shape, 3):
+            raise ArgumentError(
+                f"mask must have the image's shape {shape} and hold ids, got colours {mask.shape}; "
+                "taxonomy(name).train_ids_of_colours of weather_aug.taxonomy reads them"
+            )
         like_image("mask", mask, shape)
         if mask.dtype.newbyteorder("=") not in DTYPES:
             names = ", ".join(dtype.name for dtype in DTYPES)
-            raise ArgumentError(f"mask must be an integer array ({names}), got {mask.dtype}")
+            raise ArgumentError(
+                f"mask must be an integer array ({names}), got {mask.dtype}; it holds class ids: "
+                "mask.astype(np.uint8)"
+            )
         limits = np.iinfo(mask.dtype)
         if not limits.min <= self.ignore_index <= limits.max:
             raise ArgumentError(

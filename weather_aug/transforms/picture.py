@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from weather_aug._checks import MAX_PIXELS, finite, like_image
+from weather_aug._checks import finite
 from weather_aug._keys import uniforms
 from weather_aug.clip.depth_sources import DepthSource
 from weather_aug.clip.types import Camera, Frame, FrameKey
@@ -18,7 +18,7 @@ from weather_aug.errors import ArgumentError, printable
 from weather_aug.render.compose import RenderedFrame, render
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene.policy import WeatherPolicy
-from weather_aug.taxonomy import IGNORE, SKY
+from weather_aug.transforms.given import checked_options, checked_policy, given_depth, rgb_uint8
 from weather_aug.transforms.masks import MaskIds, hidden_in
 from weather_aug.weather import Weather
 
@@ -301,95 +301,3 @@ def default_camera(shape: tuple[int, int], speed_m_per_s: float, hfov_deg: float
         exposure_s=EXPOSURE_S,
         velocity_m_per_s=np.array([0.0, 0.0, speed_m_per_s]),
     )
-
-
-def rgb_uint8(image: Any) -> UInt8:
-    """A C-contiguous (H, W, 3) uint8 picture of a uint8 or float32 one.
-
-    Raises:
-        ArgumentError: If it is no numpy array of such a shape, type and range.
-    """
-    if not isinstance(image, np.ndarray):
-        raise ArgumentError(f"image must be a numpy array, got {type(image).__name__}")
-    if image.ndim != 3 or image.shape[2] != 3:
-        raise ArgumentError(f"image must have shape (H, W, 3), got {image.shape}")
-    height, width, _ = image.shape
-    if height == 0 or width == 0:
-        raise ArgumentError(f"image has a zero side: {image.shape}")
-    if height * width > MAX_PIXELS:
-        raise ArgumentError(f"image has {height * width} pixels, more than {MAX_PIXELS}")
-    if image.dtype == np.uint8:
-        return np.ascontiguousarray(image)
-    if image.dtype.newbyteorder("=") != np.float32:
-        raise ArgumentError(f"image must be uint8, or float32 in [0, 1], got {image.dtype}")
-    low, high = float(image.min()), float(image.max())
-    if not (low >= -1e-6 and high <= 1 + 1e-6):
-        raise ArgumentError(
-            f"image must be finite and in [0, 1], got [{low:g}, {high:g}]; weather comes before "
-            "normalisation"
-        )
-    return np.ascontiguousarray(np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8))
-
-
-def given_depth(depth: Any, shape: tuple[int, int], label: UInt8 | None) -> NDArray[Any]:
-    """A caller's depth, refused if it is mostly holes, which would silently be taken for far.
-
-    Raises:
-        ArgumentError: If it is, or is no float array of the picture's (H, W).
-    """
-    depth = np.asarray(depth)
-    like_image("depth", depth, shape)
-    if depth.dtype.kind != "f":
-        raise ArgumentError(f"depth must be a float array in metres, got {depth.dtype}")
-    known = np.isfinite(depth) & (depth > 0)
-    surface = np.ones(shape, bool) if label is None else label != SKY
-    open_sky = depth == np.inf
-    if label is not None:
-        open_sky &= label == IGNORE
-    expected = int(np.count_nonzero(surface & ~open_sky))
-    found = int(np.count_nonzero(surface & known))
-    if surface.any() and (found == 0 or 2 * found < expected):
-        raise ArgumentError(
-            f"depth is known (finite and above 0) on {found / max(expected, 1):.0%} of the pixels "
-            "outside the sky, and unknown depth counts as far: complete the depth first, or leave "
-            "it out"
-        )
-    if depth.dtype == np.float16:
-        return np.ascontiguousarray(depth)
-    with np.errstate(over="ignore"):
-        # What does not fit is as far as the sky.
-        return np.ascontiguousarray(depth, dtype=np.float32)
-
-
-def checked_policy(policy: Any) -> WeatherPolicy:
-    """A policy, its `to_dict` form, or None for the default one.
-
-    Raises:
-        ArgumentError: If it is none of these.
-    """
-    if isinstance(policy, WeatherPolicy):
-        return policy
-    return WeatherPolicy.from_dict({} if policy is None else policy)
-
-
-def checked_options(options: Any) -> RenderOptions:
-    """Options, their fields as a dict, or None for the default ones.
-
-    Raises:
-        ArgumentError: If they are none of these.
-    """
-    if options is None:
-        return DEFAULT_OPTIONS
-    if isinstance(options, RenderOptions):
-        return options
-    if not isinstance(options, dict):
-        raise ArgumentError(
-            f"options must be RenderOptions, or a dict of its fields, got {type(options).__name__}"
-        )
-    known = [each.name for each in fields(RenderOptions)]
-    unknown = sorted(set(options) - set(known), key=str)
-    if unknown:
-        raise ArgumentError(
-            f"RenderOptions has no field {printable(unknown[0])}; it has {', '.join(known)}"
-        )
-    return RenderOptions(**options)

@@ -15,7 +15,8 @@ from weather_aug.errors import ArgumentError, printable
 from weather_aug.render.compose import RenderedFrame
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene.scene import WeatherScene
-from weather_aug.transforms.picture import Drawn, rgb_uint8
+from weather_aug.transforms.given import rgb_uint8
+from weather_aug.transforms.picture import Drawn
 
 MOST_DIFFERENCE = 8.0
 """Mean over a coarse grid, in 8-bit levels, up to which a picture is that of the scene: decoders of

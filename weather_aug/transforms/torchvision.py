@@ -18,7 +18,8 @@ from weather_aug.clip.types import Camera
 from weather_aug.errors import ArgumentError, MissingExtraError, printable
 from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.transforms.draws import Draws, sample_fields
-from weather_aug.transforms.picture import Drawn, Weathered, Weathering, rgb_uint8
+from weather_aug.transforms.given import rgb_uint8
+from weather_aug.transforms.picture import Drawn, Weathered, Weathering
 from weather_aug.transforms.shelf import Shelf
 
 try:
@@ -298,7 +299,10 @@ def _pixels(picture: Any) -> tuple[NDArray[Any], tuple[int, ...]]:
     if picture.ndim < 3 or picture.shape[-3] != 3 or 0 in picture.shape:
         raise ArgumentError(f"image must have shape (..., 3, H, W), got {tuple(picture.shape)}")
     if picture.dtype not in (torch.uint8, torch.float32):
-        raise ArgumentError(f"image must be uint8, or float32 in [0, 1], got {picture.dtype}")
+        raise ArgumentError(
+            f"image must be uint8, or float32 in [0, 1], got {picture.dtype}; put "
+            "v2.ToDtype(torch.float32) before, with scale=True if it holds integers"
+        )
     if picture.requires_grad and torch.is_grad_enabled():
         raise ArgumentError(
             "image must not require a gradient, which this RandomWeather cannot give: detach it, "

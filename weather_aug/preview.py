@@ -13,7 +13,7 @@ from weather_aug._keys import check_seed
 from weather_aug.clip.types import FrameKey
 from weather_aug.errors import DataError, IntegrityError
 from weather_aug.scene.policy import WeatherPolicy
-from weather_aug.transforms.picture import checked_policy
+from weather_aug.transforms.given import checked_policy
 from weather_aug.view.panel import Panel, open_panel, panel_of_error
 from weather_aug.view.sheet import KINDS, SEVERITIES
 from weather_aug.view.source import Shown, source_of

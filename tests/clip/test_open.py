@@ -52,6 +52,12 @@ def test_unknown_scheme_lists_the_schemes() -> None:
         open_clip("kiti:/data")
 
 
+def test_a_drive_of_windows_is_no_scheme() -> None:
+    with pytest.raises(ArgumentError, match=r"has no scheme; write scheme:C:.*folder, street"):
+        open_clip(r"C:\data\camvid")
+    assert parse_uri(r"folder:C:\data\camvid?images=train").path == r"C:\data\camvid"
+
+
 def test_unknown_option_lists_the_options(tmp_path: Path) -> None:
     with pytest.raises(ArgumentError, match=r"no option 'label'; it has .*labels.*fps"):
         open_clip(f"folder:{tmp_path}?label=x")

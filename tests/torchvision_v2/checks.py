@@ -152,6 +152,16 @@ def test_clear_weather_gives_the_same_numbers(image: Any, mask: Any) -> None:
         assert bits(marked) == bits(mask)
 
 
+def test_what_the_weather_leaves_alone_keeps_its_finer_value(image: Any, mask: Any) -> None:
+    exact = v2.functional.to_dtype(image, torch.float32, scale=True)
+    fine = tv_tensors.Image((exact + 0.3 / 255).clamp(0, 1))
+    done, _ = always(CLEAR)(fine, mask)
+    assert bits(done) == bits(fine)
+    assert torch.equal(always(FOG)(fine, mask, NAME)[1], always(FOG)(exact, mask, NAME)[1])
+    both = [always(FOG)(each, mask, NAME)[0] for each in (fine, exact)]
+    assert float((both[0] - both[1]).abs().max()) < 0.4 / 255
+
+
 def unchanged(transform: Callable[..., Any], *sample: torch.Tensor) -> bool:
     before = [bits(each) for each in sample]
     done = [each for each in transform(*sample, NAME) if isinstance(each, torch.Tensor)]
@@ -603,7 +613,7 @@ REFUSED: dict[str, tuple[Callable[[Any, Any], Any], str]] = {
         lambda i, m: (PIL.Image.fromarray(m.numpy()), m),
         r"mode L; convert it with image.convert\('RGB'\)",
     ),
-    "doubles": (lambda i, m: (i.double() / 255, m), "got torch.float64"),
+    "doubles": (lambda i, m: (i.double() / 255, m), r"got torch.float64; put v2.ToDtype\("),
     "halves": (lambda i, m: (i.half() / 255, m), "got torch.float16"),
     "normalised": (lambda i, m: (i.float() / 255 - 0.5, m), "before normalisation"),
     "0..255": (lambda i, m: (i.float(), m), r"in \[0, 1\]"),

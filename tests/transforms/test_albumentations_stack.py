@@ -171,6 +171,12 @@ def test_too_few_of_each_are_refused(drive: Sample, name: str) -> None:
         RandomWeather(SNOW, p=1.0)(**drive | {name: few})
 
 
+@pytest.mark.parametrize("name", ["images", "masks", "depths", "cameras", "scene_keys"])
+def test_what_is_no_stack_is_refused(drive: Sample, name: str) -> None:
+    with pytest.raises(ArgumentError, match=f"{name} must be a list or an array, got int"):
+        RandomWeather(SNOW, p=1.0)(**drive | {name: 5})
+
+
 @pytest.mark.parametrize("name", ["mask", "depth", "camera", "scene_key"])
 def test_what_belongs_to_one_picture_is_refused(drive: Sample, name: str) -> None:
     with pytest.raises(ArgumentError, match=f"with images give {name}s"):

@@ -174,12 +174,12 @@ def test_speed_leans_the_streaks(sample: Sample) -> None:
 class Weathered(Dataset[Any]):
     """What users write: the pipeline is made once and copied into the workers."""
 
-    def __init__(self, sample: Sample) -> None:
-        self.sample = sample
-        self.pipeline = pipeline()
+    def __init__(self, sample: Sample, length: int = 8, p: float = 1.0) -> None:
+        self.sample, self.length = sample, length
+        self.pipeline = pipeline(p=p)
 
     def __len__(self) -> int:
-        return 8
+        return self.length
 
     def __getitem__(self, index: int) -> Any:
         return self.pipeline(**self.sample)["image"]
@@ -195,6 +195,18 @@ def test_two_workers_do_not_draw_the_same_weather(sample: Sample) -> None:
     pictures = [picture.numpy().tobytes() for picture in loader]
     assert len(pictures) == 8
     assert len(set(pictures)) == 8
+
+
+@pytest.mark.filterwarnings(
+    "ignore:This process .* is multi-threaded, use of fork:DeprecationWarning"
+)
+def test_two_workers_do_not_decide_alike(sample: Sample) -> None:
+    """Whether there is weather at all is not the same in both, sample after sample."""
+    dataset = Weathered(sample, length=32, p=0.5)
+    loader = DataLoader(dataset, batch_size=None, num_workers=2, timeout=60)
+    decided = [bool((picture.numpy() != sample["image"]).any()) for picture in loader]
+    assert decided[::2] != decided[1::2]
+    assert 4 <= sum(decided) <= 28
 
 
 @pytest.mark.parametrize(

@@ -322,3 +322,26 @@ def test_a_single_clip_or_an_empty_one_is_refused() -> None:
         WeatherDataset(TinyClip())  # type: ignore[arg-type]
     with pytest.raises(ArgumentError, match="clip tiny, which has no frames"):
         WeatherDataset([TinyClip(frames=0)])
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ("{", "no JSON text"),
+        ("[]", "must be an object"),
+        ("{}", "has no 'time_index'"),
+        ({"options": {"rain": 1}}, "RenderOptions has no field rain"),
+    ],
+)
+def test_what_is_no_recipe_is_refused(change: Any, says: str) -> None:
+    dataset = WeatherDataset([TinyClip()], crop=(8, 8))
+    recipe = change if isinstance(change, str) else json.loads(dataset[0]["recipe"]) | change
+    with pytest.raises(ArgumentError, match=says):
+        dataset.render_recipe(recipe)
+
+
+@pytest.mark.parametrize("name", ["options", "depth"])
+def test_what_is_none_of_its_kind_is_refused_when_it_is_made(name: str) -> None:
+    given: Any = {name: {}}
+    with pytest.raises(ArgumentError, match=f"{name} must be"):
+        WeatherDataset([TinyClip()], **given)

@@ -118,6 +118,12 @@ def test_pictures_tell_processes_apart() -> None:
     assert isinstance(picture_field(np.zeros((4, 16, 16, 3), np.uint8)), int)
 
 
+@pytest.mark.parametrize("picture", [PICTURE[..., 0], PICTURE[0, 0], PICTURE.tolist(), None])
+def test_what_is_no_picture_is_refused(picture: Any) -> None:
+    with pytest.raises(ArgumentError, match="image must"):
+        Draws("t", 0).key(picture)
+
+
 @pytest.mark.parametrize("again", [copy.deepcopy, lambda d: pickle.loads(pickle.dumps(d))])
 def test_a_copy_goes_on_alike_and_has_its_own_epoch(again: Any) -> None:
     draws = Draws("t", 4)

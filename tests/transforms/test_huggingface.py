@@ -171,6 +171,7 @@ def test_a_column_may_name_frames_of_a_scene(tiny_scene: Any) -> None:
         ({"image": [Image.new("L", (64, 48))]}, "Image.mode='RGB'"),
         ({"image": [Image.new("RGBA", (64, 48))]}, "mode RGBA"),
         ({"image": [[[0, 0, 0]]]}, "got list"),
+        ({"image": [np.zeros((48, 64), np.uint8)]}, "image must have shape"),
         ({"label": [Image.new("RGB", (64, 48))]}, "mode RGB, it must hold ids"),
         ({"label": [Image.new("1", (64, 48))]}, "mode 1"),
         ({"label": [Image.new("L", (48, 64))]}, "mask"),
@@ -180,6 +181,11 @@ def test_a_column_may_name_frames_of_a_scene(tiny_scene: Any) -> None:
 def test_what_is_no_picture_or_mask_is_named(changes: Batch, says: str) -> None:
     with pytest.raises(WeatherAugError, match=says):
         RandomWeather(FOG, p=1)(street(1) | changes)
+
+
+def test_a_row_without_a_name_is_refused() -> None:
+    with pytest.raises(ArgumentError, match="column 'id' has no name"):
+        RandomWeather(FOG, p=1, sample="id")(street(2) | {"id": [4, None]})
 
 
 def test_a_missing_column_names_those_there_are() -> None:

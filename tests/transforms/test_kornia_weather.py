@@ -290,6 +290,12 @@ def test_params_repeat_a_call(p: float) -> None:
     assert not torch.equal(weather(pictures(6), params=params), found)
 
 
+def test_cameras_of_other_pictures_are_refused() -> None:
+    wide = replace(camera(), width=2 * WIDTH)
+    with pytest.raises(ArgumentError, match="cameras must be of the pictures' size"):
+        RandomWeather(SNOW, p=1.0)(pictures(2), cameras=[None, wide])
+
+
 def test_params_of_other_pictures_are_refused() -> None:
     weather = RandomWeather(SNOW, p=1.0)
     weather(pictures(), depth=depths())
@@ -349,6 +355,17 @@ def test_ids_are_the_callers() -> None:
     assert torch.equal(found == -100, expected == IGNORE)
     with pytest.raises(ArgumentError, match="cannot hold ignore_index -100"):
         RandomWeather(FOG, ignore_index=-100)(pictures(), mask=masks(dtype=torch.uint8))
+
+
+def test_ids_without_a_train_class_are_hidden_too() -> None:
+    """The caller may train on more ids than have a train class."""
+    nameless = dict.fromkeys(range(256))
+    known: dict[str, Any] = {"mask": masks(), "depth": depths()}
+    found = RandomWeather(FOG, p=1.0, taxonomy=nameless)(pictures(), **known)[1]
+    hidden = found != masks()
+    assert hidden.any()
+    assert (found[hidden] == IGNORE).all()
+    assert (depths()[hidden] > 10).all()
 
 
 def test_labels_are_kept_where_the_options_say_so() -> None:

@@ -45,6 +45,15 @@ def test_the_ignored_id_is_never_looked_up(index: int, table: str) -> None:
     assert (found == IGNORE).tolist() == [[False, True, False], [False, True, False]]
 
 
+@pytest.mark.parametrize("unknown_ids", ["error", "ignore"])
+def test_255_may_be_a_class_of_the_callers(unknown_ids: Any) -> None:
+    """As in masks of black and white; what is ignored has another id there."""
+    ids = MaskIds({0: "sidewalk", 255: "road"}, 7, unknown_ids)
+    found = ids.train_ids(mask_of(0, 255, 7, 7, 255, 0), SHAPE)
+    assert found is not None
+    assert found.tolist() == [[1, 0, IGNORE], [IGNORE, 0, 1]]
+
+
 def test_unknown_ids_are_a_fault_or_no_class() -> None:
     mask = mask_of(0, 0, 0, 0, 77, 0)
     with pytest.raises(DataError, match="label id 77"):
@@ -87,7 +96,7 @@ def test_marks_keep_type_and_all_else(mask: np.ndarray, hidden: np.ndarray) -> N
 
 @pytest.mark.parametrize("dtype", [np.float32, bool, np.int8, np.uint32, np.uint64, complex, "O"])
 def test_other_types_are_refused_by_name(dtype: Any) -> None:
-    with pytest.raises(ArgumentError, match="mask must be an integer array"):
+    with pytest.raises(ArgumentError, match=r"mask must be an integer .*; it holds class ids"):
         MaskIds().train_ids(np.zeros(SHAPE, dtype), SHAPE)
     assert np.dtype(dtype) not in DTYPES
 
@@ -97,6 +106,7 @@ def test_other_types_are_refused_by_name(dtype: Any) -> None:
     [
         ([[0, 0, 0]] * 2, "mask must be a numpy array, got list"),
         (np.zeros((3, 2), np.uint8), "mask must have the image's shape"),
+        (np.zeros((*SHAPE, 3), np.uint8), "got colours .*; .*train_ids_of_colours"),
         (np.zeros((1, *SHAPE), np.uint8), "mask must have the image's shape"),
     ],
 )
@@ -117,6 +127,7 @@ def test_an_index_that_the_mask_cannot_hold_is_refused() -> None:
         ({"taxonomy": 3}, "taxonomy must be a name"),
         ({"taxonomy": {"road": 0}}, "taxonomy must map integer ids"),
         ({"taxonomy": {0: "lava"}}, "lava"),
+        ({"taxonomy": {}}, "at least one id"),
         ({"ignore_index": 1.5}, "ignore_index"),
         ({"ignore_index": 2**31}, "ignore_index"),
         ({"unknown_ids": "guess"}, "unknown_ids"),

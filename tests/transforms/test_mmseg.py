@@ -151,6 +151,8 @@ def test_a_scene_gives_the_full_effect(tiny_scene: Any) -> None:
     expected = tiny_scene.render(key, drawn.weather, seed=drawn.seed)
     assert (expected.image == done["img"][..., ::-1]).all()
     assert (expected.label == done["gt_seg_map"]).all()
+    with pytest.raises(ArgumentError, match="mask must have the image's shape"):
+        transform(results | {"scene_key": str(key), "gt_seg_map": results["gt_seg_map"][1:]})
 
 
 @GENERATIONS
@@ -209,6 +211,11 @@ def wrong(name: str) -> Results:
 def test_what_came_before_in_the_wrong_order_is_named(name: str, says: str) -> None:
     with pytest.raises(ArgumentError, match=says):
         RandomWeather(FOG, p=1)(wrong(name))
+
+
+def test_a_size_that_nobody_noted_is_not_compared() -> None:
+    results = new() | {"ori_shape": None}
+    assert (RandomWeather(FOG, p=1)(results)["img"] != results["img"]).any()
 
 
 @pytest.mark.parametrize(

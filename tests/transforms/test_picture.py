@@ -8,17 +8,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from tiny_clip import TinyClip
 
 from weather_aug.air import air_of
 from weather_aug.clip.types import Camera, Frame, FrameKey
 from weather_aug.errors import ArgumentError
 from weather_aug.render import compose
-from weather_aug.render.options import RenderOptions
+from weather_aug.render.options import LabelPolicy, RenderOptions
 from weather_aug.scene.policy import WeatherPolicy
-from weather_aug.taxonomy import IGNORE, SKY
+from weather_aug.taxonomy import CLASSES, IGNORE, ROAD, SKY
 from weather_aug.transforms import picture
-from weather_aug.transforms.picture import Drawn, Weathering, default_camera, light_of, rgb_uint8
+from weather_aug.transforms.given import rgb_uint8
+from weather_aug.transforms.picture import Drawn, Weathering, default_camera, light_of
 from weather_aug.weather import Weather
 
 FOG = Weathering.of(WeatherPolicy.fog((40, 60)))
@@ -76,6 +78,22 @@ def test_clear_weather_is_the_picture_itself(frame: Frame) -> None:
     assert (done.mask == frame.label).all()
     fine = (frame.image / np.float32(255.7)).astype(np.float32)
     assert (CLEAR.render(fine, CLEAR.draw(1), mask=frame.label).image == fine).all()
+
+
+@pytest.mark.parametrize("labels", ["ignore_unseen", "acdc", "keep"])
+def test_ids_without_a_train_class_are_hidden_too(frame: Frame, labels: LabelPolicy) -> None:
+    """The caller may train on more ids than have a train class."""
+    names = {index: None if index == ROAD else name for index, name in enumerate(CLASSES)}
+    own = Weathering.of(
+        FOG.policy, taxonomy=names | {IGNORE: None}, options=RenderOptions(labels=labels)
+    )
+    done = own.render(frame.image, FOG.draw(1), mask=frame.label, depth=frame.depth_m)
+    assert done.mask is not None
+    classless = frame.label == ROAD
+    unreadable = classless & (done.shot.invalid != 0)
+    assert 0 < unreadable.sum() < classless.sum()
+    expected = unreadable if labels == "ignore_unseen" else np.zeros_like(unreadable)
+    assert ((done.mask == IGNORE)[classless] == expected[classless]).all()
 
 
 @pytest.mark.parametrize("taxonomy", ["train_ids", None])
@@ -139,6 +157,18 @@ def test_a_stack_is_each_picture_at_its_time_under_one_light() -> None:
     assert (done[0].image != done[1].image).any()
 
 
+@pytest.mark.parametrize("name", ["masks", "depths", "cameras"])
+def test_a_stack_takes_sequences(name: str) -> None:
+    with pytest.raises(ArgumentError, match=f"{name} must be a sequence, got int"):
+        SNOW.render_stack(stack_of(2)[0], SNOW.draw(5), fps=10, **{name: 5})
+
+
+def test_what_is_no_camera_is_refused(frame: Frame) -> None:
+    camera: Any = {"fx": 500}
+    with pytest.raises(ArgumentError, match="camera must be a Camera, got dict"):
+        SNOW.render(frame.image, SNOW.draw(1), camera=camera)
+
+
 def test_a_light_for_each_picture_would_be_seen() -> None:
     images, masks, depths = stack_of(2)
     images[1] = 255 - images[1] // 4
@@ -178,7 +208,8 @@ def test_the_default_camera_sees_as_wide_as_it_is_told() -> None:
     ("arguments", "says"),
     [
         ({"policy": {"types": {"hail": 1}}}, "hail"),
-        ({"policy": "rain"}, "WeatherPolicy is read from an object"),
+        ({"policy": "rain"}, r"policy must be a WeatherPolicy, .* got str; write WeatherPolicy\("),
+        ({"policy": Weather.fog("heavy")}, "policy must be a WeatherPolicy, .* got Weather;"),
         ({"speed_m_per_s": 5}, "speed_m_per_s must be a range"),
         ({"speed_m_per_s": (9, 3)}, "speed_m_per_s must be a range"),
         ({"speed_m_per_s": (0, 1000)}, "speed_m_per_s"),
@@ -194,6 +225,26 @@ def test_the_default_camera_sees_as_wide_as_it_is_told() -> None:
 def test_bad_choices_are_refused_at_once(arguments: dict[str, Any], says: str) -> None:
     with pytest.raises(ArgumentError, match=says):
         Weathering.of(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("image", "says"),
+    [
+        (torch.zeros(3, 8, 9), "got Tensor; weather comes before conversion to tensors"),
+        (np.zeros((3, 8, 9), np.uint8), r"got \(3, 8, 9\): move .* image.transpose\(1, 2, 0\)"),
+        (np.zeros((8, 9, 4), np.uint8), "got .*: leave its alpha out"),
+        (np.zeros((8, 9), np.uint8), "got .*: read it in colour"),
+        (np.zeros((8, 9, 5), np.uint8), r"got \(8, 9, 5\)$"),
+        (np.zeros((8, 9, 3)), "got float64; convert it with image.astype"),
+        (np.full((8, 9, 3), 200, np.float32), "divide it by 255, or keep uint8"),
+        (np.full((8, 9, 3), -1.5, np.float32), "weather comes before normalisation"),
+        (np.full((8, 9, 3), np.nan, np.float32), "weather comes before normalisation"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_refused_picture_is_told_its_cure(image: Any, says: str) -> None:
+    with pytest.raises(ArgumentError, match=says):
+        rgb_uint8(image)
 
 
 def test_a_camera_that_is_given_is_used(frame: Frame) -> None:

@@ -130,6 +130,18 @@ def test_every_position_goes_on_exactly(tiny_scene: WeatherScene, ranks: int) ->
             assert again.padding == (padding if k < len(order) else ())
 
 
+def test_an_epoch_that_is_gone_back_to_is_whole(dataset: WeatherDataset) -> None:
+    sampler = WeatherSampler(dataset)
+    sampler.set_epoch(3)
+    sampler.load_state_dict(sampler.state_dict(done=20))
+    sampler.set_epoch(3)
+    assert len(list(sampler)) == 3
+    sampler.set_epoch(4)
+    sampler.set_epoch(3)
+    assert sorted(sampler) == list(range(23))
+    assert sampler.padding == ()
+
+
 @pytest.fixture(scope="module")
 def day(tiny_scene: WeatherScene) -> WeatherDataset:
     return dataset_of(tiny_scene, 24)

@@ -149,6 +149,7 @@ def test_strategies_are_values(law: Uniform | RareClass) -> None:
         ({"strategy": "rare"}, "strategy must be one of uniform, rare_class, got 'rare'"),
         ({"strategy": "uniform", "temperature": 1}, "has no field temperature"),
         ([], "strategy must be"),
+        ({"strategy": ["uniform"]}, "strategy must be"),
     ],
 )
 def test_what_is_no_strategy_is_refused(state: Any, says: str) -> None:

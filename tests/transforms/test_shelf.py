@@ -57,11 +57,20 @@ def test_a_frame_that_is_not_there_is_refused(tiny_scene: WeatherScene, key: Any
         Shelf([tiny_scene.path]).find(key)
 
 
+@pytest.mark.parametrize("key", [12, 1.5, {1, 2}])
+def test_what_is_no_key_is_refused(tiny_scene: WeatherScene, key: Any) -> None:
+    with pytest.raises(ArgumentError, match="scene_key must be"):
+        Shelf([tiny_scene.path]).find(key)
+    with pytest.raises(ArgumentError, match="there is no scene"):
+        Shelf([tiny_scene.path]).find(([key], 1, "front"))
+
+
 def test_an_empty_shelf_says_what_it_needs() -> None:
     with pytest.raises(ArgumentError, match=r"scene_key needs scenes: RandomWeather\(.*scenes="):
         Shelf(()).find(KEY)
-    with pytest.raises(ArgumentError, match="write scenes="):
-        Shelf("scenes/0000")
+    for paths in ("scenes/0000", Path("scenes/0000"), 5, None, [5]):
+        with pytest.raises(ArgumentError, match="write scenes="):
+            Shelf(paths)  # type: ignore[arg-type]
     with pytest.raises(SceneError):
         Shelf(["/nowhere/at/all"]).find(KEY)
 

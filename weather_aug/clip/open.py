@@ -43,6 +43,11 @@ def open_clip(uri: str) -> Clip:
         >>> clip = open_clip("street:?frames=4&width=96&height=64")  # doctest: +SKIP
     """
     parsed = parse_uri(uri)
+    if len(parsed.scheme) == 1:
+        raise ArgumentError(
+            f"{printable(uri)!r} is a path on a drive of Windows and has no scheme; write "
+            f"scheme:{printable(uri)} with a scheme of {', '.join(_READERS)}"
+        )
     if parsed.scheme not in _READERS:
         raise ArgumentError(
             f"no scheme {printable(parsed.scheme)!r} in {printable(uri)!r}; there are "

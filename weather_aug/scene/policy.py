@@ -92,8 +92,15 @@ class WeatherPolicy:
         if not 0 < sum(types.values()) < math.inf:
             raise ArgumentError("the weights of types must sum to a finite number above 0")
         try:
-            low, high = (parse_severity(s) for s in self.severity)
-        except (TypeError, ValueError) as error:
+            first, second = [self.severity] if isinstance(self.severity, str) else self.severity
+        except (TypeError, ValueError):
+            raise ArgumentError(
+                "severity must be a range (low, high) in [0, 1], got "
+                f"{printable(repr(self.severity))}"
+            ) from None
+        try:
+            low, high = parse_severity(first), parse_severity(second)
+        except ArgumentError as error:
             raise ArgumentError(
                 f"severity must be a range (low, high) in [0, 1]: {error}"
             ) from None

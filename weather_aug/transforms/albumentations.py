@@ -64,6 +64,9 @@ else:
         def __call__(self, *args: Any, force_apply: bool = False, **data: Any) -> Any:
             """Decide by its name whether a named sample gets weather."""
             applied = self.decided(data, force_apply)
+            if applied is None and not (force_apply or self.replay_mode) and worker_seed():
+                # Its workers would all decide alike.
+                applied = self.gate(int(self.random_generator.integers(2**62)), worker_seed())
             if applied is False:
                 self.params: dict[str, Any] = {}
                 return data
@@ -196,9 +199,11 @@ class RandomWeather(_Host):
         """Whether a named sample gets weather; None leaves that to the host."""
         if data.get("sample_key") is None or force_apply or self.replay_mode:
             return None
-        # Of a domain of its own, so that it says nothing about the weather.
-        key = key_of("albumentations-p", self._key(data) % 2**64)
-        return bool(uniforms(key, 1)[0] < self.p)
+        return self.gate(self._key(data) % 2**64)
+
+    def gate(self, *fields: int) -> bool:
+        """Whether there is weather; of a domain of its own, so that it says nothing about it."""
+        return bool(uniforms(key_of("albumentations-p", *fields), 1)[0] < self.p)
 
     def drawn(self, data: Mapping[str, Any], generator: np.random.Generator) -> Drawn:
         """Weather, seed and speed for one call."""
@@ -245,6 +250,11 @@ class RandomWeather(_Host):
                 raise ArgumentError(
                     f"{name} belongs to image=…; with images give {name}s, one for each picture"
                 )
+        for name in ("images", "masks", *_OF_A_STACK):
+            if not isinstance(data.get(name), Sequence | np.ndarray | None):
+                raise ArgumentError(
+                    f"{name} must be a list or an array, got {type(data[name]).__name__}"
+                )
         images, given, scene_keys = data["images"], data.get("masks"), data.get("scene_keys")
         masks = None if given is None else [_plane(mask) for mask in given]
         if scene_keys is None:
@@ -286,8 +296,6 @@ class RandomWeather(_Host):
         self, scene_key: Any, image: Any, mask: NDArray[Any] | None, drawn: Drawn
     ) -> Weathered:
         shot = self.shelf.render(scene_key, image, drawn, self.weathering.options)
-        if mask is not None:
-            self.weathering.ids.check(mask, shot.image.shape[:2])
         return self.weathering.handed_back(image, mask, shot)
 
     def add_targets(self, additional_targets: dict[str, str]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,6 +27,7 @@ from weather_aug.transforms.dataset_checks import (
     all_labelled,
     check_crop,
     check_fits,
+    check_kinds,
     check_output,
     check_strategies,
     check_viewpoints,
@@ -41,6 +41,7 @@ from weather_aug.transforms.items import (
     Output,
     Sample,
     clear_of,
+    recipe_fields,
     recipe_of,
     rendered,
     rendered_again,
@@ -121,6 +122,7 @@ class WeatherDataset(Dataset[Any]):
         with_clear: bool = False,
         depth: DepthSource | None = None,
     ) -> None:
+        check_kinds(options, depth)
         self._sources = sources_of(scenes, depth or DepthSource())
         self.policy = checked_policy(policy)
         self.seed = check_seed("seed", seed)
@@ -214,9 +216,9 @@ class WeatherDataset(Dataset[Any]):
             recipe: Of an item of this data set, or of another one of the same scenes and clips.
 
         Raises:
-            ArgumentError: If its scene or clip is not among them.
+            ArgumentError: If it is no recipe, or its scene or clip is not among them.
         """
-        fields = json.loads(recipe) if isinstance(recipe, str) else recipe
+        fields = recipe_fields(recipe)
         for source in self._sources:
             head = source.recipe_head()
             if head == {name: fields.get(name) for name in head}:

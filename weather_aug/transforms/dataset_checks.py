@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from typing import Any, get_args
 
 from weather_aug._keys import check_seed
+from weather_aug.clip.depth_sources import DepthSource
 from weather_aug.clip.types import FrameKey
 from weather_aug.errors import ArgumentError
+from weather_aug.render.options import RenderOptions
 from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.scene.viewpoint import ViewpointJitter
 from weather_aug.transforms.curriculum import SeverityCurriculum
@@ -29,6 +31,17 @@ def checked_policy(policy: Any) -> WeatherPolicy:
             'WeatherPolicy(types={"rain": 1, …}), or WeatherPolicy.from_dict(…) of a to_dict form'
         )
     return policy
+
+
+def check_kinds(options: Any, depth: Any) -> None:
+    """Refuse options and sources of depth that are none."""
+    if not isinstance(options, RenderOptions):
+        raise ArgumentError(f"options must be RenderOptions, got {type(options).__name__}")
+    if not isinstance(depth, DepthSource | None):
+        raise ArgumentError(
+            f"depth must be a DepthSource, got {type(depth).__name__}; write "
+            "DepthSource(cache=..., network=...)"
+        )
 
 
 def checked_length(length: Any) -> int:
@@ -65,8 +78,10 @@ def check_crop(crop: Any, known: KnownFrames) -> None:
     if crop is None:
         return
     pair = isinstance(crop, tuple | list) and len(crop) == 2
-    if not pair or not all(isinstance(side, int) for side in crop):
-        raise ArgumentError(f"crop must be (height, width) in pixels, got {crop!r}")
+    if not pair or not all(isinstance(side, int) and side > 0 for side in crop):
+        raise ArgumentError(
+            f"crop must be (height, width) in pixels, as crop=(256, 512), got {crop!r}"
+        )
     for source, frame in known:
         check_fits(tuple(crop), source, frame.key, frame.size)
 
@@ -75,7 +90,8 @@ def check_fits(crop: tuple[int, ...], source: Source, key: FrameKey, size: tuple
     """Refuse a crop that is larger than a frame."""
     if not (0 < crop[0] <= size[0] and 0 < crop[1] <= size[1]):
         raise ArgumentError(
-            f"crop {tuple(crop)} does not fit frame {key} of {source} ({size[0]}x{size[1]} pixels)"
+            f"crop {tuple(crop)} does not fit frame {key} of {source} ({size[0]}x{size[1]} "
+            "pixels); choose one that fits all frames"
         )
 
 

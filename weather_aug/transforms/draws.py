@@ -112,7 +112,15 @@ def sample_fields(sample: Any) -> tuple[int, ...]:
 
 
 def picture_field(picture: NDArray[Any]) -> int:
-    """64 bits of a coarse grid of a picture's pixels."""
+    """64 bits of a coarse grid of a picture's pixels.
+
+    Raises:
+        ArgumentError: If it is no array of (..., H, W, channels).
+    """
+    if not isinstance(picture, np.ndarray):
+        raise ArgumentError(f"image must be a numpy array, got {type(picture).__name__}")
+    if picture.ndim < 3:
+        raise ArgumentError(f"image must have shape (H, W, 3), got {picture.shape}")
     coarse = np.ascontiguousarray(picture[..., ::_STRIDE, ::_STRIDE, :])
     return int.from_bytes(hashlib.blake2b(coarse.tobytes(), digest_size=8).digest(), "little")
 

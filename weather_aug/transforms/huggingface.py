@@ -110,6 +110,11 @@ class RandomWeather:
         scene_key: Any = None,
         sample: Any = None,
     ) -> tuple[Any, Any]:
+        if sample is None and "sample" in self.columns:
+            raise ArgumentError(
+                f"column {printable(self.columns['sample'])!r} has no name for a row: its weather "
+                "would hang on the order of calls"
+            )
         done = self._sample(
             _pixels(picture),
             mask=None if mask is None else _ids(mask),

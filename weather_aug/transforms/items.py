@@ -11,15 +11,18 @@ import torch
 from numpy.typing import NDArray
 
 from weather_aug.clip.types import FrameKey, Window
+from weather_aug.errors import ArgumentError
 from weather_aug.render.compose import RenderedFrame
 from weather_aug.render.options import RenderOptions
 from weather_aug.scene.policy import WeatherDraw
 from weather_aug.scene.viewpoint import Viewpoint
+from weather_aug.transforms.given import checked_options
 from weather_aug.transforms.sources import Opened
 from weather_aug.weather import Weather
 
 Sample = dict[str, Any]
 Output = Literal["dict", "tuple"]
+_NEEDED = ("time_index", "camera", "weather", "seed", "options")
 
 
 class Asked(NamedTuple):
@@ -100,6 +103,24 @@ def recipe_of(head: Mapping[str, Any], key: FrameKey, draw: WeatherDraw, asked: 
     return json.dumps(recipe)
 
 
+def recipe_fields(recipe: Any) -> Mapping[str, Any]:
+    """The fields of a recipe, or of its JSON text.
+
+    Raises:
+        ArgumentError: If it is none.
+    """
+    try:
+        fields = json.loads(recipe) if isinstance(recipe, str) else recipe
+    except (ValueError, RecursionError):
+        raise ArgumentError("recipe is no JSON text") from None
+    if not isinstance(fields, Mapping):
+        raise ArgumentError(f"recipe must be an object, got {type(fields).__name__}")
+    missing = [name for name in _NEEDED if name not in fields]
+    if missing:
+        raise ArgumentError(f"recipe has no {missing[0]!r}")
+    return fields
+
+
 def rendered_again(opened: Opened, recipe: Mapping[str, Any]) -> RenderedFrame:
     """The item of a recipe.
 
@@ -111,6 +132,6 @@ def rendered_again(opened: Opened, recipe: Mapping[str, Any]) -> RenderedFrame:
     asked = Asked(
         None if window is None else tuple(window),
         None if viewpoint is None else Viewpoint.from_dict(viewpoint),
-        RenderOptions(**recipe["options"]),
+        checked_options(recipe["options"]),
     )
     return rendered(opened, Weather.from_dict(recipe["weather"]), recipe["seed"], asked)

@@ -21,6 +21,7 @@ from weather_aug.render.batch_checks import BATCH_OPTIONS, check_options, one_ea
 from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.taxonomy import IGNORE
 from weather_aug.transforms.draws import Draws
+from weather_aug.transforms.given import rgb_uint8
 from weather_aug.transforms.kornia_params import (
     Params,
     camera_of,
@@ -38,13 +39,8 @@ from weather_aug.transforms.kornia_tensors import (
     unit_range,
     whole_ids,
 )
-from weather_aug.transforms.picture import (
-    CAMERA,
-    Weathering,
-    default_camera,
-    light_of,
-    rgb_uint8,
-)
+from weather_aug.transforms.masks import hidden_in
+from weather_aug.transforms.picture import CAMERA, Weathering, default_camera, light_of
 
 # Without it the import below would fail with no word on which extra to install.
 require("kornia", extra="kornia", to="use RandomWeather on batches")
@@ -250,6 +246,12 @@ class RandomWeather(K.IntensityAugmentationBase2D):
         depths = None if depth is None else planes("depth", depth, count, shape)
         if cameras is not None:
             given = one_each("cameras", cameras, Camera, count, optional=True)
+            for each in given:
+                if each is not None and (each.height, each.width) != shape:
+                    raise ArgumentError(
+                        f"cameras must be of the pictures' size {shape}, got "
+                        f"{(each.height, each.width)}: put RandomWeather before crops and resizing"
+                    )
             params["camera"] = camera_rows(given)
         if "depth" not in params:
             params["depth"] = images.new_full(plane, torch.nan, dtype=torch.float32)
@@ -284,11 +286,9 @@ class RandomWeather(K.IntensityAugmentationBase2D):
         index = torch.tensor(rows, device=input.device)
         labels = params["label"][index, 0] if "label" in params else None
         shots = self._rendered(unit_range(input[index]), labels, params, rows)
-        if labels is not None and shots.label is not None:
-            hidden = (shots.label == IGNORE) & (labels != IGNORE)
-        else:
-            hidden = (shots.invalid != 0) & (self.weathering.options.labels != "keep")
-        params["hidden"][index, 0] = hidden
+        params["hidden"][index, 0] = hidden_in(
+            shots.label, labels, shots.invalid, self.weathering.options.labels
+        )
         params["transmittance"][index, 0] = shots.transmittance.detach().float()
         return input.index_copy(0, index, shots.image)
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from weather_aug._checks import like_image
 from weather_aug._keys import check_seed
 from weather_aug.errors import ArgumentError, printable
+from weather_aug.render.options import LabelPolicy
 from weather_aug.taxonomy import IGNORE, Taxonomy, taxonomy
 
 UInt8 = NDArray[np.uint8]
@@ -75,17 +76,15 @@ class MaskIds:
         self.check(mask, shape)
         if self._table is None:
             return None
-        known = np.where(mask == self.ignore_index, IGNORE, mask)
         table = self._table
+        ignored = mask == self.ignore_index
         if self.unknown_ids == "ignore":
-            declared = np.isin(known, [*table.class_by_id])
-            known = np.where(declared, known, IGNORE)
-        if IGNORE in table.class_by_id:
-            return table.train_ids(known, where="mask")
-        # A taxonomy may know no 255; the caller's ignored pixels have none of its classes.
-        ignored = known == IGNORE
+            ignored |= ~np.isin(mask, [*table.class_by_id])
+        elif IGNORE not in table.class_by_id:
+            ignored |= mask == IGNORE
+        # 255 may be a class of the caller's, so no id can stand for what is ignored.
         first = next(iter(table.class_by_id))
-        ids = table.train_ids(np.where(ignored, first, known), where="mask")
+        ids = table.train_ids(np.where(ignored, first, mask), where="mask")
         ids[ignored] = IGNORE
         return ids
 
@@ -97,10 +96,18 @@ class MaskIds:
         """
         if not isinstance(mask, np.ndarray):
             raise ArgumentError(f"mask must be a numpy array, got {type(mask).__name__}")
+        if mask.shape == (*shape, 3):
+            raise ArgumentError(
+                f"mask must have the image's shape {shape} and hold ids, got colours {mask.shape}; "
+                "taxonomy(name).train_ids_of_colours of weather_aug.taxonomy reads them"
+            )
         like_image("mask", mask, shape)
         if mask.dtype.newbyteorder("=") not in DTYPES:
             names = ", ".join(dtype.name for dtype in DTYPES)
-            raise ArgumentError(f"mask must be an integer array ({names}), got {mask.dtype}")
+            raise ArgumentError(
+                f"mask must be an integer array ({names}), got {mask.dtype}; it holds class ids: "
+                "mask.astype(np.uint8)"
+            )
         limits = np.iinfo(mask.dtype)
         if not limits.min <= self.ignore_index <= limits.max:
             raise ArgumentError(
@@ -126,8 +133,29 @@ class MaskIds:
         }
 
 
+def hidden_in(label: Any, full: Any, invalid: Any, policy: LabelPolicy) -> Any:
+    """Where a mask is marked: bool, of the shape of numpy arrays or tensors of any one kind.
+
+    Pixels of no train class count as hidden where they cannot be made out: the caller may train on
+    their ids.
+
+    Args:
+        label: Train ids in the weather; None where there is no label.
+        full: Train ids of the clear picture, or None.
+        invalid: 1 where the surface cannot be made out.
+        policy: See `RenderOptions.labels`.
+    """
+    told = (invalid != 0) & (policy != "keep")
+    if label is None or full is None:
+        return told
+    classless = full == IGNORE
+    return ((label == IGNORE) & ~classless) | (told & classless & (policy == "ignore_unseen"))
+
+
 def _by_id(names: Mapping[Any, Any]) -> dict[int, str | None]:
     """A mapping by integer id; JSON has made strings of its keys."""
+    if not names:
+        raise ArgumentError("taxonomy must map at least one id; None says that ids are no classes")
     try:
         return {int(index): name for index, name in names.items()}
     except (TypeError, ValueError):

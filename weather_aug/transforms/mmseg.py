@@ -191,7 +191,7 @@ def _check_whole(results: Results) -> None:
         )
     if results.get("flip"):
         raise ArgumentError("results['img'] has been flipped: put RandomWeather before RandomFlip")
-    if "ori_shape" not in results:
+    if results.get("ori_shape") is None:
         return
     # 0.x: a number or (w, h, w, h); 1.x: (w, h).
     scale = np.atleast_1d(np.asarray(results.get("scale_factor", 1.0), float))

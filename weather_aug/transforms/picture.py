@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from weather_aug._checks import MAX_PIXELS, finite, like_image
+from weather_aug._checks import finite
 from weather_aug._keys import uniforms
 from weather_aug.clip.depth_sources import DepthSource
 from weather_aug.clip.types import Camera, Frame, FrameKey
@@ -18,8 +18,8 @@ from weather_aug.errors import ArgumentError, printable
 from weather_aug.render.compose import RenderedFrame, render
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene.policy import WeatherPolicy
-from weather_aug.taxonomy import IGNORE, SKY
-from weather_aug.transforms.masks import MaskIds
+from weather_aug.transforms.given import checked_options, checked_policy, given_depth, rgb_uint8
+from weather_aug.transforms.masks import MaskIds, hidden_in
 from weather_aug.weather import Weather
 
 UInt8 = NDArray[np.uint8]
@@ -233,6 +233,8 @@ class Weathering:
         label = None if mask is None else self.ids.train_ids(mask, shape)
         if camera is None:
             camera = self._camera(shape, drawn.speed_m_per_s, time_s)
+        elif not isinstance(camera, Camera):
+            raise ArgumentError(f"camera must be a Camera, got {type(camera).__name__}")
         if depth is None:
             depth = self.depth.depth_m(picture, label, camera, self.camera_height_m)
         else:
@@ -242,7 +244,11 @@ class Weathering:
     def handed_back(
         self, image: NDArray[Any], mask: NDArray[Any] | None, shot: RenderedFrame
     ) -> Weathered:
-        """A rendered picture and its mask in the types in which they came."""
+        """A rendered picture and its mask in the types in which they came.
+
+        Raises:
+            ArgumentError: If the mask is of another type or size than the picture's.
+        """
         done: NDArray[Any] = shot.image
         if image.dtype != np.uint8:
             # What the weather leaves alone keeps its finer value.
@@ -250,12 +256,8 @@ class Weathering:
             done = np.where(same, image, shot.image / np.float32(255)).astype(np.float32)
         if mask is None:
             return Weathered(done, None, shot)
-        if self.options.labels == "keep":
-            hidden = np.zeros(shot.invalid.shape, bool)
-        elif shot.label is None or shot.label_full is None:
-            hidden = shot.invalid != 0
-        else:
-            hidden = (shot.label == IGNORE) & (shot.label != shot.label_full)
+        self.ids.check(mask, shot.image.shape[:2])
+        hidden = hidden_in(shot.label, shot.label_full, shot.invalid, self.options.labels)
         return Weathered(done, self.ids.marked(mask, hidden), shot)
 
     def _rendered(self, frame: Frame, drawn: Drawn, light: Ambience) -> RenderedFrame:
@@ -271,6 +273,8 @@ class Weathering:
 
 
 def _one_each(name: str, values: Any, count: int) -> list[Any]:
+    if not isinstance(values, Sequence | np.ndarray | None):
+        raise ArgumentError(f"{name}s must be a sequence, got {type(values).__name__}")
     found = [None] * count if values is None else list(values)
     if len(found) != count:
         raise ArgumentError(f"{name}s must hold one for each of {count} pictures, got {len(found)}")
@@ -297,95 +301,3 @@ def default_camera(shape: tuple[int, int], speed_m_per_s: float, hfov_deg: float
         exposure_s=EXPOSURE_S,
         velocity_m_per_s=np.array([0.0, 0.0, speed_m_per_s]),
     )
-
-
-def rgb_uint8(image: Any) -> UInt8:
-    """A C-contiguous (H, W, 3) uint8 picture of a uint8 or float32 one.
-
-    Raises:
-        ArgumentError: If it is no numpy array of such a shape, type and range.
-    """
-    if not isinstance(image, np.ndarray):
-        raise ArgumentError(f"image must be a numpy array, got {type(image).__name__}")
-    if image.ndim != 3 or image.shape[2] != 3:
-        raise ArgumentError(f"image must have shape (H, W, 3), got {image.shape}")
-    height, width, _ = image.shape
-    if height == 0 or width == 0:
-        raise ArgumentError(f"image has a zero side: {image.shape}")
-    if height * width > MAX_PIXELS:
-        raise ArgumentError(f"image has {height * width} pixels, more than {MAX_PIXELS}")
-    if image.dtype == np.uint8:
-        return np.ascontiguousarray(image)
-    if image.dtype.newbyteorder("=") != np.float32:
-        raise ArgumentError(f"image must be uint8, or float32 in [0, 1], got {image.dtype}")
-    low, high = float(image.min()), float(image.max())
-    if not (low >= -1e-6 and high <= 1 + 1e-6):
-        raise ArgumentError(
-            f"image must be finite and in [0, 1], got [{low:g}, {high:g}]; weather comes before "
-            "normalisation"
-        )
-    return np.ascontiguousarray(np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8))
-
-
-def given_depth(depth: Any, shape: tuple[int, int], label: UInt8 | None) -> NDArray[Any]:
-    """A caller's depth, refused if it is mostly holes, which would silently be taken for far.
-
-    Raises:
-        ArgumentError: If it is, or is no float array of the picture's (H, W).
-    """
-    depth = np.asarray(depth)
-    like_image("depth", depth, shape)
-    if depth.dtype.kind != "f":
-        raise ArgumentError(f"depth must be a float array in metres, got {depth.dtype}")
-    known = np.isfinite(depth) & (depth > 0)
-    surface = np.ones(shape, bool) if label is None else label != SKY
-    open_sky = depth == np.inf
-    if label is not None:
-        open_sky &= label == IGNORE
-    expected = int(np.count_nonzero(surface & ~open_sky))
-    found = int(np.count_nonzero(surface & known))
-    if surface.any() and (found == 0 or 2 * found < expected):
-        raise ArgumentError(
-            f"depth is known (finite and above 0) on {found / max(expected, 1):.0%} of the pixels "
-            "outside the sky, and unknown depth counts as far: complete the depth first, or leave "
-            "it out"
-        )
-    if depth.dtype == np.float16:
-        return np.ascontiguousarray(depth)
-    with np.errstate(over="ignore"):
-        # What does not fit is as far as the sky.
-        return np.ascontiguousarray(depth, dtype=np.float32)
-
-
-def checked_policy(policy: Any) -> WeatherPolicy:
-    """A policy, its `to_dict` form, or None for the default one.
-
-    Raises:
-        ArgumentError: If it is none of these.
-    """
-    if isinstance(policy, WeatherPolicy):
-        return policy
-    return WeatherPolicy.from_dict({} if policy is None else policy)
-
-
-def checked_options(options: Any) -> RenderOptions:
-    """Options, their fields as a dict, or None for the default ones.
-
-    Raises:
-        ArgumentError: If they are none of these.
-    """
-    if options is None:
-        return DEFAULT_OPTIONS
-    if isinstance(options, RenderOptions):
-        return options
-    if not isinstance(options, dict):
-        raise ArgumentError(
-            f"options must be RenderOptions, or a dict of its fields, got {type(options).__name__}"
-        )
-    known = [each.name for each in fields(RenderOptions)]
-    unknown = sorted(set(options) - set(known), key=str)
-    if unknown:
-        raise ArgumentError(
-            f"RenderOptions has no field {printable(unknown[0])}; it has {', '.join(known)}"
-        )
-    return RenderOptions(**options)

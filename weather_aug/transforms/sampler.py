@@ -86,6 +86,8 @@ class WeatherSampler(Sampler[int]):
             ArgumentError: If `epoch` is not an integer in [0, 2**63).
         """
         self.dataset.set_epoch(epoch)
+        if self.epoch != self._start_epoch:
+            self._start, self._start_epoch = 0, self.epoch
 
     @property
     def start(self) -> int:

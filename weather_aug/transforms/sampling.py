@@ -214,7 +214,7 @@ def sampling_from_dict(state: Mapping[str, Any]) -> Uniform | RareClass:
         ArgumentError: If there is no such strategy, or it has no such field.
     """
     name = state.get("strategy") if isinstance(state, Mapping) else None
-    if name not in _STRATEGIES:
+    if not isinstance(name, str) or name not in _STRATEGIES:
         raise ArgumentError(f"strategy must be one of {', '.join(_STRATEGIES)}, got {name!r}")
     strategy = _STRATEGIES[name]
     values = {field: value for field, value in state.items() if field != "strategy"}

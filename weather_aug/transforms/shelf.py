@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -15,7 +15,8 @@ from weather_aug.errors import ArgumentError, printable
 from weather_aug.render.compose import RenderedFrame
 from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene.scene import WeatherScene
-from weather_aug.transforms.picture import Drawn, rgb_uint8
+from weather_aug.transforms.given import rgb_uint8
+from weather_aug.transforms.picture import Drawn
 
 MOST_DIFFERENCE = 8.0
 """Mean over a coarse grid, in 8-bit levels, up to which a picture is that of the scene: decoders of
@@ -35,9 +36,10 @@ class Shelf:
     """
 
     def __init__(self, paths: Sequence[str | os.PathLike[str]]) -> None:
-        if isinstance(paths, str | os.PathLike):
+        given = None if isinstance(paths, str) or not isinstance(paths, Iterable) else tuple(paths)
+        if given is None or not all(isinstance(path, str | os.PathLike) for path in given):
             raise ArgumentError("scenes must be a sequence of folders; write scenes=[folder]")
-        self.paths = tuple(os.fspath(path) for path in paths)
+        self.paths = tuple(os.fspath(path) for path in given)
 
     @cached_property
     def by_name(self) -> dict[str, WeatherScene]:
@@ -104,10 +106,15 @@ class Shelf:
         """
         if not self.paths:
             raise ArgumentError("scene_key needs scenes: RandomWeather(..., scenes=[folder])")
+        if not isinstance(scene_key, Sequence):
+            raise ArgumentError(
+                "scene_key must be a frame's text, (time index, camera), or (scene's name, time "
+                f"index, camera), got {type(scene_key).__name__}"
+            )
         parts = (scene_key,) if isinstance(scene_key, str) else tuple(scene_key)
         if len(parts) == 3:
             name, *frame = parts
-            if name not in self.by_name:
+            if not isinstance(name, str) or name not in self.by_name:
                 raise ArgumentError(
                     f"there is no scene {printable(name)!r}; there are {', '.join(self.by_name)}"
                 )

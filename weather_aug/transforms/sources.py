@@ -105,8 +105,11 @@ def sources_of(given: Any, depth: DepthSource) -> tuple[Source, ...]:
         raise ArgumentError("scenes must be a sequence; write WeatherDataset([clip], ...)")
     each = tuple(given) if isinstance(given, Iterable) and not isinstance(given, str) else ()
     if not each or not all(isinstance(one, WeatherScene | Clip) for one in each):
+        strange = [one for one in each if not isinstance(one, WeatherScene | Clip)]
+        got = type(strange[0] if strange else given).__name__ if strange or not each else ""
         raise ArgumentError(
-            "scenes must be one or more of WeatherScene.load(folder) and open_clip(address)"
+            "scenes must be one or more of WeatherScene.load(folder) and open_clip(address), in a "
+            f"list, got {got}"
         )
     return tuple(
         SceneSource(one) if isinstance(one, WeatherScene) else ClipSource(one, depth, place)

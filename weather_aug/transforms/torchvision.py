@@ -18,7 +18,8 @@ from weather_aug.clip.types import Camera
 from weather_aug.errors import ArgumentError, MissingExtraError, printable
 from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.transforms.draws import Draws, sample_fields
-from weather_aug.transforms.picture import Drawn, Weathered, Weathering, rgb_uint8
+from weather_aug.transforms.given import rgb_uint8
+from weather_aug.transforms.picture import Drawn, Weathered, Weathering
 from weather_aug.transforms.shelf import Shelf
 
 try:
@@ -155,7 +156,7 @@ class RandomWeather(v2.Transform):
             return {"picture": None, "mask": None}
         done = self._weathered(sample, self.weathering.draw(key))
         return {
-            "picture": _picture_like(sample.picture, [each.image for each in done]),
+            "picture": _picture_like(sample.picture, done),
             "mask": _mask_like(sample.mask, [each.mask for each in done]),
         }
 
@@ -185,8 +186,6 @@ class RandomWeather(v2.Transform):
         done = []
         for image, mask, key in zip(sample.pixels, masks, keys, strict=True):
             shot = self.shelf.render(key, image, drawn, self.weathering.options)
-            if mask is not None:
-                self.weathering.ids.check(mask, image.shape[:2])
             done.append(self.weathering.handed_back(image, mask, shot))
         return done
 
@@ -300,7 +299,10 @@ def _pixels(picture: Any) -> tuple[NDArray[Any], tuple[int, ...]]:
     if picture.ndim < 3 or picture.shape[-3] != 3 or 0 in picture.shape:
         raise ArgumentError(f"image must have shape (..., 3, H, W), got {tuple(picture.shape)}")
     if picture.dtype not in (torch.uint8, torch.float32):
-        raise ArgumentError(f"image must be uint8, or float32 in [0, 1], got {picture.dtype}")
+        raise ArgumentError(
+            f"image must be uint8, or float32 in [0, 1], got {picture.dtype}; put "
+            "v2.ToDtype(torch.float32) before, with scale=True if it holds integers"
+        )
     if picture.requires_grad and torch.is_grad_enabled():
         raise ArgumentError(
             "image must not require a gradient, which this RandomWeather cannot give: detach it, "
@@ -327,7 +329,8 @@ def _float32(depth: torch.Tensor) -> torch.Tensor:
     return depth.float() if depth.is_floating_point() else depth
 
 
-def _picture_like(given: Any, images: list[NDArray[Any]]) -> Any:
+def _picture_like(given: Any, weathered: list[Weathered]) -> Any:
+    images = [each.image for each in weathered]
     if isinstance(given, PIL.Image.Image):
         return PIL.Image.fromarray(images[0])
     height, width, _ = images[0].shape
@@ -336,6 +339,11 @@ def _picture_like(given: Any, images: list[NDArray[Any]]) -> Any:
         place[...] = image.transpose(2, 0, 1)
     # torchvision's own steps between 8 bits and [0, 1], which differ from others in the last bit.
     scaled = v2.functional.to_dtype(torch.from_numpy(done), given.dtype, scale=True)
+    if given.is_floating_point():
+        # What the weather leaves alone keeps its finer value.
+        same = np.stack([each.image == each.shot.frame.image for each in weathered])
+        own = given.detach().as_subclass(torch.Tensor).cpu().reshape(scaled.shape)
+        scaled = torch.where(torch.from_numpy(same).movedim(-1, 1), own, scaled).contiguous()
     return _like(given, scaled)
 
 

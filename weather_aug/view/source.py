@@ -16,7 +16,8 @@ from weather_aug.errors import ArgumentError, printable
 from weather_aug.render.compose import RenderedFrame, render
 from weather_aug.render.options import RenderOptions
 from weather_aug.scene.scene import WeatherScene
-from weather_aug.transforms.picture import Drawn, Weathering, checked_options, light_of
+from weather_aug.transforms.given import checked_options
+from weather_aug.transforms.picture import Drawn, Weathering, light_of
 from weather_aug.weather import Weather
 
 Shown = WeatherScene | str | os.PathLike[str] | NDArray[Any]
@@ -110,6 +111,6 @@ def source_of(
     if not isinstance(shown, WeatherScene):
         raise ArgumentError(
             "source must be a WeatherScene, its folder, or an (H, W, 3) picture, got "
-            f"{type(shown).__name__}"
+            f"{type(shown).__name__}; of a clip show one picture: clip.frame(key).image"
         )
     return SceneSource(shown, checked_options(options))

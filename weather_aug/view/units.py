@@ -42,4 +42,4 @@ def titled(kind: str, weather: Weather) -> str:
 
 
 def _short(number: float) -> str:
-    return f"{number:.0f}" if number >= 100 else f"{number:.2g}"
+    return f"{float(f'{number:.2g}'):g}"

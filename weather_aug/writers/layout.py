@@ -126,13 +126,13 @@ LAYOUTS = {
 """By name.
 
 cityscapes   a labelled source for DAFormer, HRDA and MIC; label files are matched by base name
-acdc         a target for them; split/scene/file, as their README has ACDC itself restructured
+acdc         a target for them; the split comes first, as where their README restructures ACDC
 gta          a labelled source without folders: the rare-class sampling of its data set class looks
              for the last part of a label's path, so that labels in folders would not be found
 folders      equal stems everywhere, as `clip.folder` pairs them (taxonomy=train_ids)
 webdataset   tars of samples `<base>.<part>.png` and `<base>.json`, the recipe; see `writers.tars`
 
-Folders gta, folders and webdataset have no folder for the split: an export is one split.
+An export is one split; gta and folders have no folder for it.
 """
 
 

@@ -20,6 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from weather_aug import _files, _lock
 from weather_aug.clip.images import read_label
 from weather_aug.errors import (
@@ -119,10 +121,8 @@ def merge_cityscapes(
     is_export = (root / layout.CONTENTS).exists()
     first = _source_of_export(root) if is_export else _source_of_root(root, progress)
     merged = _united([first, *map(_source_of_export, exports)])
-    with (
-        _lock.exclusive(out / _LOCK, f"{printable(out, 200)} is being merged"),
-        _files.reported(out),
-    ):
+    busy = f"{printable(out, 200)} is being merged"
+    with _lock.exclusive(out / _LOCK, busy), _files.reported(out):
         try:
             foreign = _foreign_file(out, merged.files)
             if foreign is not None:
@@ -164,12 +164,20 @@ def _checked_out(out: Path, sources: list[Path]) -> Path:
         if out.exists() and not out.is_dir():
             raise OutputError(f"{printable(out, 200)} is not a folder; choose another output")
         found = {path.name for path in out.iterdir()} - {_LOCK} if out.exists() else set()
-    if found and not (out / CONTENTS).exists():
+    if found and not _is_merge(out):
         raise ConflictError(
-            f"{printable(out, 200)} is no merge, but holds {printable(sorted(found)[0])}; choose an "
-            "empty or new folder"
+            f"{printable(out, 200)} is no merge, but holds {printable(sorted(found)[0])}; choose "
+            "an empty or new folder"
         )
     return out
+
+
+def _is_merge(out: Path) -> bool:
+    try:
+        contents = _files.read_json(out / CONTENTS)
+    except DataError:
+        return False
+    return isinstance(contents, dict) and contents.get("format") == FORMAT
 
 
 def _source_of_root(root: Path, progress: bool) -> _Source:
@@ -190,7 +198,7 @@ def _source_of_root(root: Path, progress: bool) -> _Source:
         raise DataError(
             f"{printable(root, 200)} is not converted to train ids: {len(missing)} of {len(paths)} "
             f"training pictures have no label ({printable(missing[0], 160)} first); run "
-            f"`{CONVERTER} {printable(root, 200)}` in a checkout of HRDA or MIC"
+            f"`{CONVERTER} {printable(root, 200)}` in a checkout of HRDA or of MIC's seg"
         )
     known = _known_stats(root)
     unknown = [path for path in paths if Path(path).name not in known]
@@ -198,7 +206,9 @@ def _source_of_root(root: Path, progress: bool) -> _Source:
         path: _counted(files[path])
         for path in tqdm(unknown, desc="count", unit="label", disable=not progress)
     }
-    labels = {path: counted[path] if path in counted else known[Path(path).name] for path in paths}
+    labels: dict[str, Mapping[str, int]] = {
+        path: counted[path] if path in counted else known[Path(path).name] for path in paths
+    }
     return _Source(files, labels, len(unknown))
 
 
@@ -213,9 +223,9 @@ def _files_below(root: Path, part: str) -> Iterator[tuple[str, Path]]:
 
 def _counted(label: Path) -> dict[str, int]:
     ids = read_label(label)
-    if ids.dtype != "uint8":
+    if ids.dtype != np.uint8:
         raise DataError(f"{printable(label, 200)} has 16 bits; train ids have 8")
-    return class_pixels(ids)
+    return class_pixels(ids.astype(np.uint8))
 
 
 def _known_stats(root: Path) -> dict[str, dict[str, int]]:
@@ -246,15 +256,18 @@ def _checked_pixels(row: Mapping[str, Any]) -> dict[str, int]:
 def _source_of_export(export: Path) -> _Source:
     """Every file of a finished export, and the class pixels that its manifest tells."""
     shown = printable(export, 200)
-    if not (export / layout.CONTENTS).is_file():
-        raise DataError(f"{shown} is no finished export (no {layout.CONTENTS}); run it to its end")
-    with _files.reported(export):
+    try:
         contents = layout.read_contents(export)
+    except OSError as error:
+        raise DataError(
+            f"{shown} is no finished export ({layout.CONTENTS}: {error.strerror}); run it to its "
+            "end, or check the path"
+        ) from None
     job = contents["job"]
     for name, wanted in (("layout", "cityscapes"), ("split", SPLIT)):
-        if job[name] != wanted:
+        if job.get(name) != wanted:
             raise ArgumentError(
-                f"{shown} has the {name} {printable(job[name])}; a labelled source needs {wanted}"
+                f"{shown} has the {name} {printable(job.get(name))}; a labelled source needs {wanted}"
             )
     if contents["labelled"] != contents["samples"]:
         raise ArgumentError(
@@ -294,13 +307,13 @@ def _united(sources: Sequence[_Source]) -> _Source:
     places: dict[str, Path] = {}
     for source in sources:
         for path, pixels in source.labels.items():
-            place = places.setdefault(Path(path).name, source.files[path])
-            if place is not source.files[path]:
+            name, place = Path(path).name, source.files[path]
+            if name in places:
                 raise ConflictError(
-                    f"{printable(place, 200)} and {printable(source.files[path], 200)} have one "
-                    "base name, by which trainers tell labels apart; give each export once"
+                    f"{printable(places[name], 200)} and {printable(place, 200)} have one base "
+                    "name, by which trainers tell labels apart; give each export once"
                 )
-            labels[path] = pixels
+            labels[path], places[name] = pixels, place
         files |= source.files
     return _Source(files, labels, sum(source.counted for source in sources))
 
@@ -329,9 +342,9 @@ def _entries(out: Path) -> Iterator[tuple[str, Path]]:
 def _foreign_file(out: Path, files: Mapping[str, Path]) -> Path | None:
     """A file in `out` that is neither a link nor the same file as one that shall be linked to."""
     for relative, path in _entries(out):
-        known = relative in files and path.exists() and path.samefile(files[relative])
-        if not (path.is_symlink() or known):
-            return path
+        if path.is_symlink() or (relative in files and path.samefile(files[relative])):
+            continue
+        return path
     return None
 
 
@@ -351,7 +364,7 @@ def _linked(link: Path, to: Path, hard: bool) -> bool:
     target = os.path.relpath(to, link.parent)
     if hard and not link.is_symlink() and link.exists():
         return False
-    if not hard and link.is_symlink() and os.readlink(link) == target:
+    if not hard and link.is_symlink() and str(link.readlink()) == target:
         return False
     link.parent.mkdir(parents=True, exist_ok=True)
     link.unlink(missing_ok=True)

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from test_crash import assert_committed_verifies, exit_status_of_fork
 from tiny_export import POLICY, tree_of
 
 from weather_aug import _files
@@ -276,6 +277,41 @@ def test_a_tar_that_cannot_be_written_leaves_nothing(
     with pytest.raises(_files.OutputError, match="No space left"):
         write_unit(plan, target.LocalFolder(tmp_path), 0)
     assert list((tmp_path / "shards").iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def small(scene: WeatherScene) -> ExportPlan:
+    plan = plan_export([scene], POLICY, count=3, seed=3, layout="webdataset")
+    return replace(plan, layout=replace(plan.layout, items_per_unit=2))
+
+
+@pytest.fixture(scope="module")
+def small_tree(small: ExportPlan, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    out = tmp_path_factory.mktemp("small") / "out"
+    export(small, out)
+    return tree_of(out)
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+@pytest.mark.parametrize("finished", [False, True])
+@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.slow), 4])
+def test_killed_at_any_call_it_can_be_continued(
+    small: ExportPlan, small_tree: dict[str, str], tmp_path: Path, finished: bool, every: int
+) -> None:
+    """Once from nothing, once while a damaged tar is being repaired."""
+    call, status = 1 - every, 1
+    while status != 0:
+        call += every
+        out = tmp_path / str(call)
+        if finished:
+            export(small, out)
+            (out / TARS[0]).unlink()
+        status = exit_status_of_fork(small, out, call)
+        if not finished:
+            assert_committed_verifies(out)
+        export(small, out)
+        assert tree_of(out) == small_tree
+    assert call > 25
 
 
 def test_leftovers_of_a_killed_run_are_removed(plan: ExportPlan, whole: Path, out: Path) -> None:

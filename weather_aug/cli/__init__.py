@@ -1,4 +1,4 @@
-"""The command line; `Command` lists what it can do."""
+"""The command line: what `Command` lists, from demo to train-editor."""
 
 from __future__ import annotations
 

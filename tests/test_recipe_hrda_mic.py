@@ -1,6 +1,6 @@
 """Configs for HRDA and MIC: merged by mmcv's rules, and loaded by the trainers' rules.
 
-The checkouts are stand-ins with the file names and keys of the real ones; none was run.
+The checkouts are stand-ins, see `trainer_checkout`; no real one was run.
 """
 
 from __future__ import annotations
@@ -19,43 +19,16 @@ import numpy as np
 import pytest
 from PIL import Image
 from writers.tiny_export import POLICY, TinyClip
+from writers.trainer_checkout import DATASET, PLACES, RECIPE, checkout_in, config_of, run
 from writers.trainers import Pictures, RareClasses, Sizes
 
+from weather_aug import _files
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.writers.export import export
 from weather_aug.writers.layout import LAYOUTS, read_contents, sealed_contents
 from weather_aug.writers.plan import plan_export
 
-RECIPE = Path(__file__).parents[1] / "recipes" / "hrda_mic"
 SIZES = Sizes(scale=(256, 192), crop=160)
-
-PLACES = """
-data = dict(
-    samples_per_gpu=2,
-    workers_per_gpu=4,
-    train=dict(
-        type='UDADataset',
-        source=dict(type='CityscapesDataset', data_root='data/cityscapes/',
-                    img_dir='leftImg8bit/train', ann_dir='gtFine/train', pipeline=['cut']),
-        target=dict(type='ACDCDataset', data_root='data/acdc/',
-                    img_dir='rgb_anon/train', ann_dir='gt/train', pipeline=['cut'])),
-    val=dict(type='ACDCDataset', data_root='data/acdc/', img_dir='rgb_anon/val', ann_dir='gt/val'))
-"""
-BASES = {
-    "default_runtime.py": "log_level = 'INFO'\n",
-    "models/daformer_sepaspp_mitb5.py": (
-        "model = dict(type='EncoderDecoder', pretrained='pretrained/mit_b5.pth',\n"
-        "             decode_head=dict(type='DAFormerHead', num_classes=19),\n"
-        "             test_cfg=dict(mode='whole'))\n"
-    ),
-    "datasets/uda_cityscapesHR_to_acdcHR_1024x1024.py": PLACES,
-    "uda/dacs_a999_fdthings.py": (
-        "uda = dict(type='DACS', alpha=0.999, mask_generator=None)\nuse_ddp_wrapper = True\n"
-    ),
-    "uda/dacs_fdthings_srconly.py": "uda = dict(type='DACS', source_only=True)\n",
-    "schedules/adamw.py": "optimizer = dict(type='AdamW', lr=6e-05, weight_decay=0.01)\n",
-    "schedules/poly10warm.py": "lr_config = dict(policy='poly', warmup_iters=1500)\n",
-}
 
 
 @pytest.fixture(scope="module")
@@ -82,32 +55,6 @@ def data(finished: Callable[..., Path], tmp_path: Path) -> Path:
     return shutil.copytree(finished(), tmp_path / "data")
 
 
-def checkout_in(folder: Path, name: str) -> Path:
-    """A stand-in for a clone: hrda, hrda-dg or mic."""
-    root = folder / name / "seg" if name == "mic" else folder / name
-    trainer = "mic" if name == "mic" else "hrda"
-    example = "gtaHR2csHR_mic_hrda.py" if name == "mic" else "gtaHR2csHR_hrda.py"
-    texts = {f"configs/_base_/{path}": text for path, text in BASES.items()}
-    texts |= {f"configs/{trainer}/{example}": "", "run_experiments.py": ""}
-    if name == "hrda-dg":
-        texts["mmseg/datasets/dg_dataset.py"] = ""
-    for path, text in texts.items():
-        (root / path).parent.mkdir(parents=True, exist_ok=True)
-        (root / path).write_text(text)
-    return folder / name
-
-
-def run(
-    role: str, data: Path, checkout: Path, out: Path | None = None, python: str = sys.executable
-) -> subprocess.CompletedProcess[str]:
-    seg = checkout / "seg" if checkout.name == "mic" else checkout
-    out = out or seg / "configs/weather_aug/made.py"
-    command = [python, RECIPE, "--role", role, "--data", data, "--checkout", checkout, "--out", out]
-    return subprocess.run(
-        [str(part) for part in command], capture_output=True, text=True, check=False, timeout=60
-    )
-
-
 def refused(done: subprocess.CompletedProcess[str]) -> str:
     """The one sentence of a run that wrote nothing."""
     assert done.returncode == 2, done.stdout + done.stderr
@@ -117,36 +64,6 @@ def refused(done: subprocess.CompletedProcess[str]) -> str:
     assert lines[0].startswith("error: ")
     assert ";" in lines[0], "no cure"
     return lines[0]
-
-
-def config_of(path: Path) -> dict[str, Any]:
-    """A config and its bases, merged by mmcv's rules: bases may not share names."""
-    named: dict[str, Any] = {}
-    if path.suffix == ".json":
-        named = json.loads(path.read_text())
-    else:
-        exec(path.read_text(), {}, named)
-    bases = named.pop("_base_", [])
-    merged: dict[str, Any] = {}
-    for base in [bases] if isinstance(bases, str) else bases:
-        one = config_of(path.parent / base)
-        assert not merged.keys() & one.keys(), "mmcv refuses names that two bases share"
-        merged |= one
-    return merged_into(merged, named)
-
-
-def merged_into(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    made = dict(base)
-    for key, value in over.items():
-        deletes = isinstance(value, dict) and value.get("_delete_", False)
-        if isinstance(value, dict) and key in base and not deletes:
-            assert isinstance(base[key], dict), f"mmcv merges no dict into {key}"
-            made[key] = merged_into(base[key], value)
-        elif isinstance(value, dict):
-            made[key] = {k: v for k, v in value.items() if k != "_delete_"}
-        else:
-            made[key] = value
-    return made
 
 
 def as_started(checkout: Path, done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
@@ -262,9 +179,7 @@ def changed(data: Path) -> None:
 
 def resealed(**fields: Any) -> Callable[[Path], None]:
     def harm(data: Path) -> None:
-        contents = read_contents(data)
-        contents["job"] |= fields.pop("job", {})
-        (data / "export.json").write_bytes(sealed_contents(contents | fields))
+        (data / "export.json").write_bytes(sealed_contents(read_contents(data) | fields))
 
     return harm
 
@@ -297,7 +212,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "unfinished": (unfinished, "run the same export again to continue"),
     "changed": (changed, "has changed since it was written"),
     "newer": (resealed(version=99), "take the recipe of the weather_aug that wrote it"),
-    "layout": (resealed(job={"layout": "webdataset"}), "which no data set class"),
+    "layout": (resealed(job={"layout": "webdataset", "split": "train"}), "which no data set class"),
     "unlabelled": (resealed(labelled=1), "3 of 4 samples"),
     "label gone": (lambda data: first(data, "gtFine").unlink(), "cannot be read"),
     "label in colour": (label_in_colour, "is no label of one channel"),
@@ -326,8 +241,6 @@ def manifest_with(data: Path, change: Callable[[list[dict[str, Any]]], None]) ->
 
 
 def reseal_file(data: Path, name: str) -> None:
-    from weather_aug import _files
-
     contents = read_contents(data)
     path = data / name
     stored = {"size": path.stat().st_size, "sha256": _files.sha256_of_file(path)}
@@ -377,7 +290,7 @@ def test_statistics_that_would_end_a_run_are_found(data: Path, tmp_path: Path) -
 def test_a_checkout_that_is_none_is_refused(finished: Callable[..., Path], tmp_path: Path) -> None:
     checkout = checkout_in(tmp_path, "hrda")
     assert "is no checkout" in refused(run("source", finished(), tmp_path / "nothing"))
-    dataset = checkout / "configs/_base_/datasets/uda_cityscapesHR_to_acdcHR_1024x1024.py"
+    dataset = checkout / "configs/_base_" / DATASET
     dataset.write_text(PLACES.replace("ann_dir", "labels"))
     assert "has no data.train.source.ann_dir" in refused(run("source", finished(), checkout))
     dataset.unlink()

@@ -7,13 +7,13 @@ settings for this pair of data sets exist only as generated configs.
 from __future__ import annotations
 
 import os
-import pprint
 from pathlib import Path
 from typing import Any
 
 from checkouts import Checkout
 from exported import Exported, Size
 
+LINE = 88
 CROP_PX = 1024
 SCALE_PX = {"source": Size(2048, 1024), "target": Size(1920, 1080)}
 """Longest long and short side that pictures are resized to, keeping their aspect."""
@@ -89,8 +89,19 @@ def resized(size: Size, limits: Size) -> Size:
     return Size(int(size.width * ratio + 0.5), int(size.height * ratio + 0.5))
 
 
-def _literal(value: Any) -> str:
-    return pprint.pformat(value, width=96, sort_dicts=False)
+def _literal(value: Any, indent: int = 0) -> str:
+    """A value as Python writes it, one item a line where it is long."""
+    flat = repr(value)
+    if not isinstance(value, (dict, list)) or indent + len(flat) <= LINE:
+        return flat
+    inside = indent + 4
+    if isinstance(value, dict):
+        items = [f"{key!r}: {_literal(one, inside)}" for key, one in value.items()]
+    else:
+        items = [_literal(one, inside) for one in value]
+    opening, closing = "{}" if isinstance(value, dict) else "[]"
+    lines = "".join(f"{' ' * inside}{item},\n" for item in items)
+    return f"{opening}\n{lines}{' ' * indent}{closing}"
 
 
 _MODEL = {

@@ -26,6 +26,7 @@ from weather_aug import _files
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.writers.export import export
 from weather_aug.writers.layout import LAYOUTS, read_contents, sealed_contents
+from weather_aug.writers.merge import merge_cityscapes
 from weather_aug.writers.plan import plan_export
 
 SIZES = Sizes(scale=(256, 192), crop=160)
@@ -129,6 +130,28 @@ def test_without_a_target_the_branch_dg_trains_on_the_export_alone(
         assert cure in line
 
 
+def test_exports_merged_with_cityscapes_are_one_source(
+    finished: Callable[..., Path], tmp_path: Path
+) -> None:
+    """The root of Cityscapes is another export here: it has the same files."""
+    checkout, root, merge = checkout_in(tmp_path, "mic"), tmp_path / "root", tmp_path / "merge"
+    scene = WeatherScene.build(TinyClip("root", 2, 128, 96, tint=9), tmp_path / "scene")
+    export(plan_export([scene], POLICY, count=3, seed=1), root)
+    merge_cityscapes(root, [finished()], merge)
+    done = run("source", merge, checkout)
+    assert done.returncode == 0, done.stderr
+    train = as_started(checkout, done)["data"]["train"]
+    source = Pictures.of(train["source"], sizes=SIZES)
+    rare = RareClasses.of(merge, source, **train["rare_class_sampling"])
+    rng = np.random.default_rng(0)
+    assert {rare.draw(rng).index for _ in range(90)} == set(range(7))
+    assert "is a source; give an export" in refused(run("target", merge, checkout))
+    next((merge / "gtFine").rglob("*.png")).unlink()
+    assert "cannot be read" in refused(run("source", merge, checkout))
+    (merge / "samples_with_class.json").unlink()
+    assert "run the same merge again" in refused(run("source", merge, checkout))
+
+
 def test_all_else_stays_as_the_authors_have_it(
     finished: Callable[..., Path], tmp_path: Path
 ) -> None:
@@ -157,14 +180,16 @@ def test_what_was_not_checked_is_said(finished: Callable[..., Path], tmp_path: P
     assert "classes 13 occur, but never with more than 3000 pixels" in said
     assert "not checked here, because nothing of the checkout was run:" in said
     assert "pretrained/mit_b5.pth is not in the checkout" in said
-    assert "does not record which pictures trained the editor" in said
+    assert "does not record what trained the editor" in said
 
 
 def test_the_editors_of_backgrounds_are_named(data: Path, tmp_path: Path) -> None:
-    contents = read_contents(data) | {"editors": [{"pair_list": "acdc"}]}
-    (data / "export.json").write_bytes(sealed_contents(contents))
+    card = {"single": {"rain": {"training": {"pair_list": "acdc", "steps": 9}}}}
+    editors = [{"editor": "single", "card": card}, {"editor": "instruct-pix2pix", "card": {}}]
+    resealed(editors=editors)(data)
     said = run("source", data, checkout_in(tmp_path, "hrda")).stdout
-    assert "an editor trained on acdc; do not evaluate" in said
+    assert "the editor single made backgrounds, trained on acdc; do not evaluate" in said
+    assert "trained on pictures that nobody recorded" in said
 
 
 def unfinished(data: Path) -> None:

@@ -13,6 +13,7 @@ import argparse
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 from checkouts import ROLES, Checkout, open_checkout
 from exported import Exported, read_export
@@ -22,7 +23,7 @@ from settings import config_text, notes
 HELP = {
     "role": "source: labelled, in place of Cityscapes; target: unlabelled, in place of ACDC; "
     "source-only: labelled, and no target (HRDA, branch dg)",
-    "data": "folder that `weather-aug export` wrote",
+    "data": "folder that `weather-aug export` or, of a source, `weather-aug merge` wrote",
     "checkout": "unmodified clone of HRDA or MIC",
     "out": "config to write, below the checkout's folder configs",
     "seed": "of the training",
@@ -91,14 +92,23 @@ def _leakage(exported: Exported) -> list[str]:
     """What an evaluation must leave out."""
     if exported.editors is None:
         return [
-            "the export does not record which pictures trained the editor of its backgrounds; if "
-            "any is of ACDC, do not evaluate on ACDC"
+            "the export does not record what trained the editor of its backgrounds; if any picture "
+            "of ACDC did, do not evaluate on ACDC"
         ]
     return [
-        f"backgrounds were made by an editor trained on {editor.get('pair_list')}; do not evaluate "
-        "on pictures of that list (trained_on.txt beside the adapter)"
+        f"the editor {editor['editor']} made backgrounds, trained on "
+        f"{', '.join(_pair_lists(editor['card'])) or 'pictures that nobody recorded'}; do not "
+        "evaluate on any of them (trained_on.txt beside its adapter knows each)"
         for editor in exported.editors
     ]
+
+
+def _pair_lists(card: Any) -> list[str]:
+    """Names of what an editor was trained on, from its card, which may hold others' cards."""
+    if not isinstance(card, dict):
+        return []
+    own = [card["pair_list"]] if isinstance(card.get("pair_list"), str) else []
+    return own + [name for value in card.values() for name in _pair_lists(value)]
 
 
 def _unchecked(checkout: Checkout, role: str) -> list[str]:

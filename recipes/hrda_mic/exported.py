@@ -1,4 +1,4 @@
-"""What an export holds, and whether HRDA and MIC can train on it; standard library only.
+"""What an export or a merge holds, and whether HRDA and MIC can train on it.
 
 Convention:
     Everything that a trainer would only find out while it runs is looked at here, file by file:
@@ -13,13 +13,14 @@ import json
 import os
 import struct
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from refused import Refused
 
 FORMAT, NEWEST_VERSION = "weather_aug export", 2
+STATS, BY_CLASS = "sample_class_stats.json", "samples_with_class.json"
 MIN_PIXELS = 3000
 """Rare-class sampling counts a file for a class if it has more pixels of it than this."""
 
@@ -64,19 +65,25 @@ READERS = {
 }
 
 
+class Listed(NamedTuple):
+    """A sample's files, relative to the data; bytes where they were recorded."""
+
+    image: str
+    image_bytes: int | None
+    label: str | None
+    label_bytes: int | None
+
+
 class Exported(NamedTuple):
-    """A finished export."""
+    """A finished export, or exports merged with Cityscapes."""
 
     root: Path
     layout: str
     reader: Reader
     """With the split filled in."""
     samples: int
-    labelled: int
     sizes: dict[Size, int]
     """Pictures of each size."""
-    classes: list[int]
-    """Train ids in the class statistics."""
     dropped: list[int]
     """Train ids that occur, but in no file often enough to be sampled."""
     editors: list[Any] | None
@@ -84,15 +91,17 @@ class Exported(NamedTuple):
 
 
 def read_export(root: Path, *, labelled: bool) -> Exported:
-    """Check a finished export for a trainer.
+    """Check a finished export, or a merge of some, for a trainer.
 
     Args:
-        root: Folder of the export.
+        root: Folder of the export or of the merge.
         labelled: Whether labels and class statistics are needed, as a source does.
 
     Raises:
         Refused: If a trainer could not load it.
     """
+    if (root / "merge.json").is_file():
+        return _read_merge(root, labelled)
     contents = _contents(root)
     layout, split = contents["job"]["layout"], contents["job"]["split"]
     if layout not in READERS:
@@ -100,22 +109,43 @@ def read_export(root: Path, *, labelled: bool) -> Exported:
             f"{root} has the layout {layout!r}, which no data set class of HRDA or MIC reads; "
             f"export it again as {' or '.join(READERS)}"
         )
-    reader = READERS[layout]
-    reader = reader._replace(
-        img_dir=reader.img_dir.format(split=split), ann_dir=reader.ann_dir.format(split=split)
-    )
+    reader = _reader(layout, split)
     if labelled and contents["labelled"] < contents["samples"]:
         unlabelled = contents["samples"] - contents["labelled"]
         raise Refused(
             f"{unlabelled} of {contents['samples']} samples in {root} have no label, and a source "
             "is trained on labels; export labelled scenes only, or use it as a target"
         )
-    sizes = _check_samples(root, contents, reader, labelled)
+    _check_root_file(root, contents, "manifest.jsonl")
+    sizes = _check_samples(root, reader, _manifest(root), labelled)
     if labelled:
-        _check_class_stats(root, contents, reader)
-    return Exported(
-        *(root, layout, reader, contents["samples"], contents["labelled"], dict(sizes)),
-        *(contents["classes"], contents["dropped_classes"], contents.get("editors")),
+        for name in (STATS, BY_CLASS):
+            _check_root_file(root, contents, name)
+        _check_class_stats(root, reader)
+    dropped, editors = contents["dropped_classes"], contents.get("editors")
+    return Exported(root, layout, reader, contents["samples"], dict(sizes), dropped, editors)
+
+
+def _read_merge(root: Path, labelled: bool) -> Exported:
+    """Cityscapes and exports, linked into one source; its statistics are written last."""
+    if not labelled:
+        raise Refused(f"{root} is a merge, which is a source; give an export as a target")
+    if not (root / BY_CLASS).is_file():
+        raise Refused(f"{root} is not finished; run the same merge again")
+    reader = _reader("cityscapes", "train")
+    sizes = _check_samples(root, reader, _linked(root, reader), labelled)
+    _check_class_stats(root, reader)
+    editors: list[Any] | None = []
+    for export in _json(root / "merge.json")["exports"]:
+        found = _contents(root / export).get("editors")
+        editors = None if editors is None or found is None else editors + found
+    return Exported(root, "merge", reader, sum(sizes.values()), dict(sizes), [], editors)
+
+
+def _reader(layout: str, split: str) -> Reader:
+    reader = READERS[layout]
+    return reader._replace(
+        img_dir=reader.img_dir.format(split=split), ann_dir=reader.ann_dir.format(split=split)
     )
 
 
@@ -143,52 +173,59 @@ def _contents(root: Path) -> dict[str, Any]:
 
 
 def _check_samples(
-    root: Path, contents: dict[str, Any], reader: Reader, labelled: bool
+    root: Path, reader: Reader, samples: Iterable[Listed], labelled: bool
 ) -> Counter[Size]:
-    """Every file that the loaders will open, as the manifest lists them; sizes of the pictures."""
+    """Every file that the loaders will open; how many pictures there are of each size."""
     sizes: Counter[Size] = Counter()
-    listed: dict[str, str] = {}
-    for files in _manifest(root, contents):
-        image = files["image"]["path"]
-        size = _checked_png(root, files["image"], RGB)
+    image_by_name: dict[str, str] = {}
+    for image, image_bytes, label, label_bytes in samples:
+        size = _checked_png(root / image, image_bytes, RGB)
         sizes[size] += 1
         name = image.rsplit("/", 1)[-1]
-        if name in listed:
+        if name in image_by_name:
             raise Refused(
-                f"{image} and {listed[name]} in {root} have one base name, by which the trainers "
-                "tell labels apart; export again, without renaming or merging by hand"
+                f"{image} and {image_by_name[name]} in {root} have one base name, by which the "
+                "trainers tell labels apart; export again, without renaming or merging by hand"
             )
-        listed[name] = image
+        image_by_name[name] = image
         if labelled:
-            if _label_of(image, reader) != files["label"]["path"]:
+            if label is None or label != _label_of(image, reader):
                 raise Refused(
-                    f"{files['label']['path']} in {root} is not where {reader.type} looks for the "
-                    f"label of {image}; export again, files must not be renamed"
+                    f"{label} in {root} is not where {reader.type} looks for the label of {image}; "
+                    "export again, files must not be renamed"
                 )
-            if _checked_png(root, files["label"], GREY) != size:
+            if _checked_png(root / label, label_bytes, GREY) != size:
                 raise Refused(f"{image} in {root} and its label differ in size; export again")
     found = sum(1 for _ in scanned(root / reader.img_dir, reader.img_suffix))
-    if found != len(listed):
+    if found != len(image_by_name):
         raise Refused(
-            f"{root / reader.img_dir} holds {found} pictures, the export made {len(listed)}, and "
-            "the loaders take all that they find; remove what is not of the export"
+            f"{root / reader.img_dir} holds {found} pictures, the export made "
+            f"{len(image_by_name)}, and the loaders take all that they find; remove what is not of "
+            "the export"
         )
     return sizes
 
 
 def scanned(folder: Path, suffix: str) -> Iterator[str]:
     """Files below a folder by suffix, of any depth; links are followed, as the loaders do."""
-    for _, _, names in os.walk(str(folder), followlinks=True):
+    for below, _, names in os.walk(str(folder), followlinks=True):
         for name in names:
             if name.endswith(suffix) and not name.startswith("."):
-                yield name
+                yield (Path(below) / name).relative_to(folder).as_posix()
 
 
-def _manifest(root: Path, contents: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    _check_root_file(root, contents, "manifest.jsonl")
+def _manifest(root: Path) -> Iterator[Listed]:
     with (root / "manifest.jsonl").open(encoding="utf-8") as lines:
         for line in lines:
-            yield json.loads(line)["files"]
+            files = json.loads(line)["files"]
+            image, label = files["image"], files.get("label", {})
+            yield Listed(image["path"], image["size"], label.get("path"), label.get("size"))
+
+
+def _linked(root: Path, reader: Reader) -> Iterator[Listed]:
+    for name in scanned(root / reader.img_dir, reader.img_suffix):
+        image = f"{reader.img_dir}/{name}"
+        yield Listed(image, None, _label_of(image, reader), None)
 
 
 def _label_of(image: str, reader: Reader) -> str:
@@ -197,18 +234,17 @@ def _label_of(image: str, reader: Reader) -> str:
     return f"{reader.ann_dir}/{relative.replace(reader.img_suffix, reader.seg_map_suffix)}"
 
 
-def _checked_png(root: Path, stored: dict[str, Any], colours: int) -> Size:
+def _checked_png(path: Path, recorded_bytes: int | None, colours: int) -> Size:
     """Size of a PNG of 8 bits, from its header."""
-    path = root / stored["path"]
     try:
         with path.open("rb") as file:
             head = file.read(PNG_HEAD_BYTES)
-            whole = file.seek(0, os.SEEK_END) == stored["size"]
+            whole = recorded_bytes in (None, file.seek(0, os.SEEK_END))
     except OSError as error:
         raise Refused(
             f"{path} cannot be read ({error.strerror}); run the same export again, it repairs"
         ) from None
-    if not whole or head[:8] != b"\x89PNG\r\n\x1a\n":
+    if not whole or len(head) < PNG_HEAD_BYTES or head[:8] != b"\x89PNG\r\n\x1a\n":
         raise Refused(f"{path} is not whole; run the same export again, it repairs")
     width, height, bits, found = struct.unpack(">IIBB", head[16:26])
     if (bits, found) != (8, colours):
@@ -217,29 +253,27 @@ def _checked_png(root: Path, stored: dict[str, Any], colours: int) -> Size:
     return Size(width, height)
 
 
-def _check_class_stats(root: Path, contents: dict[str, Any], reader: Reader) -> None:
+def _check_class_stats(root: Path, reader: Reader) -> None:
     """What rare-class sampling asserts when the training starts, minutes into it."""
-    stats, by_class = "sample_class_stats.json", "samples_with_class.json"
-    for name in (stats, by_class):
-        _check_root_file(root, contents, name)
-    classes = {int(c) for row in _json(root / stats) for c in row if c != "file"}
+    classes = {int(c) for row in _json(root / STATS) for c in row if c != "file"}
     if not classes:
         raise Refused(
             f"no class in {root} has {MIN_PIXELS} pixels in one picture, so that rare-class "
             "sampling has nothing to draw; export larger pictures"
         )
-    files = {int(c): rows for c, rows in _json(root / by_class).items()}
-    labels = set(scanned(root / reader.ann_dir, reader.seg_map_suffix))
+    files = {int(c): rows for c, rows in _json(root / BY_CLASS).items()}
+    scan = scanned(root / reader.ann_dir, reader.seg_map_suffix)
+    labels = {path.rsplit("/", 1)[-1] for path in scan}
     for train_id in sorted(classes):
         rare = [path for path, pixels in files.get(train_id, []) if pixels > MIN_PIXELS]
         if not rare:
             raise Refused(
-                f"class {train_id} is in {root / stats} but has no file with more than "
+                f"class {train_id} is in {root / STATS} but has no file with more than "
                 f"{MIN_PIXELS} pixels, where the trainers stop; run the same export again"
             )
         lost = [path for path in rare if path.rsplit("/", 1)[-1] not in labels]
         if lost:
-            raise Refused(f"{root / by_class} names {lost[0]}, which is not there; export again")
+            raise Refused(f"{root / BY_CLASS} names {lost[0]}, which is not there; export again")
 
 
 def _check_root_file(root: Path, contents: dict[str, Any], name: str) -> None:

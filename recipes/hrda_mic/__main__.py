@@ -53,7 +53,7 @@ def main(arguments: list[str] | None = None) -> int:
     for item in _unchecked(checkout, given.role):
         print(f"  {item}")
     print("start, in the environment of the checkout (Python 3.8, torch 1.7.1, mmcv-full 1.3.7):")
-    print(f"  cd {checkout.root.resolve()}")
+    print(f"  cd {checkout.root}")
     print(f"  python run_experiments.py --config {relative}")
     return 0
 

@@ -77,7 +77,7 @@ def notes(exported: Exported, role: str) -> list[str]:
         found.append(note)
     if kind == "source" and exported.dropped:
         found.append(
-            f"classes {', '.join(map(str, exported.dropped))} occur, but never with more than "
+            f"train ids {', '.join(map(str, exported.dropped))} occur, but never with more than "
             "3000 pixels in one picture: they are learnt, not sampled"
         )
     return found

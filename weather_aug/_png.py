@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -12,16 +14,17 @@ LEVEL = 3
 """Of zlib; higher levels cost more time than rendering and save less than a tenth."""
 
 
-def png_bytes(image: NDArray[np.uint8]) -> bytes:
-    """Encode (H, W, 3) RGB or a single-channel (H, W) uint8 picture.
+def png_bytes(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
+    """Encode a (H, W, 3) uint8 RGB picture, or a plane (H, W) of uint8 or uint16.
 
     Raises:
         ArgumentError: If the picture cannot be a PNG.
     """
     # OpenCV answers other arrays with exceptions of its own.
-    if image.dtype != np.uint8 or image.size == 0 or not _is_picture(image.shape):
+    if image.size == 0 or not _is_picture(image):
         raise ArgumentError(
-            f"a picture must be uint8 of shape (H, W) or (H, W, 3), got {image.dtype} {image.shape}"
+            "a picture must be uint8 of shape (H, W) or (H, W, 3), or uint16 of shape (H, W), got "
+            f"{image.dtype} {image.shape}"
         )
     pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     ok, png = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, LEVEL])
@@ -31,5 +34,7 @@ def png_bytes(image: NDArray[np.uint8]) -> bytes:
     return encoded
 
 
-def _is_picture(shape: tuple[int, ...]) -> bool:
-    return len(shape) == 2 or (len(shape) == 3 and shape[2] == 3)
+def _is_picture(image: NDArray[Any]) -> bool:
+    if image.ndim == 2:
+        return image.dtype in (np.uint8, np.uint16)
+    return image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3

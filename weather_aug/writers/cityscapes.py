@@ -6,6 +6,7 @@
 
 A trainer asserts that every class of the statistics has a file with more than 3,000 of its pixels,
 so a class without one is left out of all three. Files are matched by base name; paths are relative.
+GTADataset looks for that name in its folder of labels itself, so its labels must stand flat there.
 """
 
 from __future__ import annotations

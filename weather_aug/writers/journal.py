@@ -65,9 +65,25 @@ def write_journal(path: Path, job: dict[str, Any], lines: Iterable[str] = ()) ->
             file.write(sealed(line))
 
 
-def is_whole(target: Target, files: dict[str, Any], *, digests: bool) -> bool:
-    """Whether a sample's files are there with their sizes and (`digests`) their bytes."""
-    return all(target.is_whole(file["path"], file, digests=digests) for file in files.values())
+class WholeFiles:
+    """Whether samples' files are there with their sizes and (`digests`) their bytes.
+
+    Samples that follow each other in a tar ask for the same file: it is read once.
+    """
+
+    def __init__(self, target: Target, *, digests: bool) -> None:
+        self._target, self._digests = target, digests
+        self._last: tuple[dict[str, Any], bool] = ({}, False)
+
+    def __call__(self, files: dict[str, Any]) -> bool:
+        """Whether all files of a sample are whole."""
+        return all(self._is_whole(file) for file in files.values())
+
+    def _is_whole(self, file: dict[str, Any]) -> bool:
+        if file != self._last[0]:
+            whole = self._target.is_whole(file["path"], file, digests=self._digests)
+            self._last = (file, whole)
+        return self._last[1]
 
 
 class Journal:
@@ -182,7 +198,8 @@ class _Kept:
     """The lines of an interrupted journal whose files are whole; counts the others."""
 
     def __init__(self, path: Path, plan: ExportPlan, target: Target, progress: bool) -> None:
-        self._path, self._plan, self._target, self._progress = path, plan, target, progress
+        self._path, self._plan, self._progress = path, plan, progress
+        self._whole = WholeFiles(target, digests=True)
         self.dropped = 0
 
     def __iter__(self) -> Iterator[str]:
@@ -206,7 +223,7 @@ class _Kept:
             entry = _files.parse_json(text, str(self._path))
             index, files = int(entry["item"]), entry["files"]
             paths = {part: file["path"] for part, file in files.items()}
-            in_plan = 0 <= index < self._plan.count and paths == self._plan.paths(index)
+            in_plan = 0 <= index < self._plan.count and paths == self._plan.files(index)
         except (DataError, KeyError, TypeError, ValueError, AttributeError):
             return None
-        return index if in_plan and is_whole(self._target, files, digests=True) else None
+        return index if in_plan and self._whole(files) else None

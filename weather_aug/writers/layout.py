@@ -42,22 +42,26 @@ class Layout:
 
     name: str
     paths: Mapping[str, str]
-    """Path of each part, of `{split}`, `{scene}` (folders) and `{base}` (unique in the export)."""
+    """Path of each part, of `{split}`, `{scene}` (folders) and `{base}` (unique in the export);
+    the name of its member where samples stand in tars."""
     parts: tuple[str, ...]
     """Parts that are written if nobody chooses."""
-    has_class_stats: bool
+    has_class_stats: bool = False
     """Whether the files of rare-class sampling are written, too."""
+    tar: str | None = None
+    """Path of a unit's tar, of `{split}` and `{unit}`; None where each part is a file."""
     items_per_unit: int = 1
     """Samples that are committed together: 1, or the samples of a tar."""
 
     def path(self, part: str, *, split: str, scene: str, base: str) -> str:
-        """Path of a sample's part, relative to the export."""
+        """Path of a sample's part, relative to the export, or the name of its member."""
         return self.paths[part].format(split=split, scene=scene, base=base)
 
     @property
     def roots(self) -> tuple[str, ...]:
         """Top folders that samples stand in."""
-        return tuple(dict.fromkeys(path.split("/")[0] for path in self.paths.values()))
+        paths = self.paths.values() if self.tar is None else (self.tar,)
+        return tuple(dict.fromkeys(path.split("/")[0] for path in paths))
 
 
 LAYOUTS = {
@@ -75,9 +79,61 @@ LAYOUTS = {
             ("image", "label"),
             has_class_stats=True,
         ),
+        Layout(
+            "acdc",
+            {
+                "image": "rgb_anon/{split}/{scene}/{base}_rgb_anon.png",
+                "label": "gt/{split}/{scene}/{base}_gt_labelTrainIds.png",
+                "invalid": "gt/{split}/{scene}/{base}_gt_invIds.png",
+                "transmittance": "transmittance/{split}/{scene}/{base}_transmittance.png",
+                "depth": "depth/{split}/{scene}/{base}_depth.png",
+            },
+            ("image", "label", "invalid"),
+        ),
+        Layout(
+            "gta",
+            {
+                "image": "images/{base}.png",
+                "label": "labels/{base}_labelTrainIds.png",
+                "invalid": "invalid/{base}.png",
+                "transmittance": "transmittance/{base}.png",
+                "depth": "depth/{base}.png",
+            },
+            ("image", "label"),
+            has_class_stats=True,
+        ),
+        Layout(
+            "folders",
+            {
+                "image": "images/{scene}/{base}.png",
+                "label": "labels/{scene}/{base}.png",
+                "invalid": "invalid/{scene}/{base}.png",
+                "transmittance": "transmittance/{scene}/{base}.png",
+                "depth": "depth/{scene}/{base}.png",
+            },
+            ("image", "label"),
+        ),
+        Layout(
+            "webdataset",
+            {part: f"{{base}}.{part}.png" for part in PARTS},
+            ("image", "label"),
+            tar="shards/{split}-{unit:06d}.tar",
+            # A tar is made in memory: 32 samples of 1920 x 1080 are about 130 MB.
+            items_per_unit=32,
+        ),
     )
 }
-"""By name."""
+"""By name.
+
+cityscapes   a labelled source for DAFormer, HRDA and MIC; label files are matched by base name
+acdc         a target for them; the split comes first, as where their README restructures ACDC
+gta          a labelled source without folders: the rare-class sampling of its data set class looks
+             for the last part of a label's path, so that labels in folders would not be found
+folders      equal stems everywhere, as `clip.folder` pairs them (taxonomy=train_ids)
+webdataset   tars of samples `<base>.<part>.png` and `<base>.json`, the recipe; see `writers.tars`
+
+An export is one split; gta and folders have no folder for it.
+"""
 
 
 def layout_called(name: str) -> Layout:
@@ -89,6 +145,12 @@ def layout_called(name: str) -> Layout:
     if name not in LAYOUTS:
         raise ArgumentError(f"layout {printable(name)!r} is not one of {', '.join(LAYOUTS)}")
     return LAYOUTS[name]
+
+
+def parts_of(entry: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The parts of a manifest's entry by name: members of its tar, or files."""
+    parts: Mapping[str, Any] = entry.get("members", entry["files"])
+    return parts
 
 
 def sealed_contents(contents: dict[str, Any]) -> bytes:

@@ -12,7 +12,7 @@ from weather_aug import _files
 from weather_aug.errors import DataError
 from weather_aug.writers import layout
 from weather_aug.writers.cityscapes import ClassStats
-from weather_aug.writers.journal import Journal, is_whole
+from weather_aug.writers.journal import Journal, WholeFiles
 from weather_aug.writers.plan import ExportPlan
 from weather_aug.writers.target import Target
 
@@ -37,8 +37,9 @@ def finish(plan: ExportPlan, target: Target, journal: Journal) -> dict[str, Any]
             entry = json.loads(line)
             stats.add(index, entry["class_pixels"])
             kinds[entry["recipe"]["kind"]] += 1
-            counts["labelled"] += "label" in entry["files"]
-            counts["bytes"] += sum(part["size"] for part in entry["files"].values())
+            parts = layout.parts_of(entry)
+            counts["labelled"] += "label" in parts
+            counts["bytes"] += sum(part["size"] for part in parts.values())
     names = [layout.MANIFEST]
     if counts["labelled"] and plan.layout.has_class_stats:
         names += stats.write(out, lambda index: plan.paths(index).get("label"))
@@ -76,7 +77,8 @@ def is_finished_whole(
         unit="sample",
         disable=not progress,
     )
-    return all(is_whole(target, json.loads(line)["files"], digests=digests) for line in lines)
+    whole = WholeFiles(target, digests=digests)
+    return all(whole(json.loads(line)["files"]) for line in lines)
 
 
 def usable_lines(out: Path, contents: dict[str, Any]) -> Iterator[str]:

@@ -73,6 +73,7 @@ class ExportPlan:
         return {
             "layout": self.layout.name,
             "parts": list(self.parts),
+            "items_per_unit": self.layout.items_per_unit,
             "split": self.split,
             "format_version": VERSION,
             "package_version": weather_aug.__version__,
@@ -97,15 +98,29 @@ class ExportPlan:
         scene_index, record, draw = self._chosen(index)
         return PlannedItem(index, scene_index, record.key, draw)
 
-    def paths(self, index: int) -> dict[str, str]:
-        """Relative path of each part of an item; there is no `label` where its frame has none.
+    def base(self, index: int) -> str:
+        """What the names of an item's parts begin with.
 
-        Base names carry the job's digest and the item, so they stay unique when exports of several
+        It carries the job's digest and the item, so that it stays unique when exports of several
         jobs are merged or two scenes share a name.
         """
         scene_index, record, _ = self._chosen(index)
-        scene = self.scenes[scene_index].name
-        base = f"{scene}_{self.digest[:8]}_{index:06d}_{record.key}"
+        return f"{self.scenes[scene_index].name}_{self.digest[:8]}_{index:06d}_{record.key}"
+
+    def files(self, index: int) -> dict[str, str]:
+        """Relative paths of the files that hold an item: one a part, or the tar of its unit."""
+        if self.layout.tar is None:
+            return self.paths(index)
+        unit = index // self.layout.items_per_unit
+        return {"tar": self.layout.tar.format(split=self.split, unit=unit)}
+
+    def paths(self, index: int) -> dict[str, str]:
+        """Relative path of each part of an item; there is no `label` where its frame has none.
+
+        Where items stand in tars, names of members.
+        """
+        scene_index, record, _ = self._chosen(index)
+        scene, base = self.scenes[scene_index].name, self.base(index)
         return {
             part: self.layout.path(part, split=self.split, scene=scene, base=base)
             for part in self.parts
@@ -141,6 +156,8 @@ class ExportPlan:
 
     def folders(self) -> list[str]:
         """Relative folders that the samples stand in."""
+        if self.layout.tar is not None:
+            return [self.layout.tar.rpartition("/")[0]]
         found: dict[str, None] = {}
         for scene in self.scenes:
             labelled = any("label" in record.files for record in scene.manifest.frames)

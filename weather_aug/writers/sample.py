@@ -21,6 +21,7 @@ from weather_aug.taxonomy import CLASSES
 from weather_aug.weather import Weather
 from weather_aug.writers.plan import ExportPlan
 from weather_aug.writers.target import Target
+from weather_aug.writers.tars import Tar
 
 DEPTH_STEPS_PER_M = 256.0
 
@@ -57,8 +58,14 @@ def render_recipe(scene: WeatherScene, recipe: Mapping[str, Any]) -> RenderedFra
 def encoded_parts(shot: RenderedFrame, parts: Sequence[str] = ("image", "label")) -> Encoded:
     """PNG bytes of each part; no `label` where the frame has none.
 
-    Image RGB, label and invalid 8 bits; transmittance 16 bits of a share (65535 is all); depth 16
-    bits in 1/256 m, as KITTI's, with 0 for the sky and what is farther than 255.9 m.
+    image          RGB, 8 bits
+    label          train ids, 8 bits; 255 is ignored
+    invalid        8 bits; 1 where a surface cannot be told, else 0, as ACDC's
+    transmittance  16 bits; the share of light that arrives, times 65535, to within 1/131070
+    depth          16 bits, KITTI's convention, which `clip.folder` reads: z-depth in 1/256 m, to
+                   within 1/512 m; 0, "unknown", for the sky and from 256 m on
+
+    A reader of depth tells the sky from what is far by the label of the clear picture.
     """
     made = {}
     for part in parts:
@@ -95,7 +102,24 @@ def write_unit(plan: ExportPlan, target: Target, unit: int) -> list[str]:
         SceneError: If the scene cannot be read.
         OutputError: If a file cannot be written.
     """
+    if plan.layout.tar is not None:
+        return _write_tar(plan, target, unit)
     return [write_sample(plan, target, index) for index in plan.items_of(unit)]
+
+
+def _write_tar(plan: ExportPlan, target: Target, unit: int) -> list[str]:
+    """As `write_unit`; the unit's samples are the members of one tar, in item order."""
+    tar, entries = Tar(), []
+    for index in plan.items_of(unit):
+        entry, parts = rendered(plan, index)
+        members = {part: tar.add(name, parts[part]) for part, name in plan.paths(index).items()}
+        tar.add(f"{plan.base(index)}.json", json.dumps(entry["recipe"], allow_nan=False).encode())
+        entries.append(entry | {"members": members})
+    (path,) = set(plan.files(plan.items_of(unit).start).values())
+    data = tar.closed()
+    target.write_whole(path, data)
+    files = {"tar": _stored(path, data)}
+    return [json.dumps(entry | {"files": files}, allow_nan=False) for entry in entries]
 
 
 def write_sample(plan: ExportPlan, target: Target, index: int) -> str:
@@ -104,8 +128,12 @@ def write_sample(plan: ExportPlan, target: Target, index: int) -> str:
     for part, path in plan.paths(index).items():
         data = parts[part]
         target.write_whole(path, data)
-        entry["files"][part] = {"path": path, "size": len(data), "sha256": _files.sha256_of(data)}
+        entry["files"][part] = _stored(path, data)
     return json.dumps(entry, allow_nan=False)
+
+
+def _stored(path: str, data: bytes) -> dict[str, Any]:
+    return {"path": path, "size": len(data), "sha256": _files.sha256_of(data)}
 
 
 def rendered(plan: ExportPlan, index: int) -> tuple[dict[str, Any], Encoded]:

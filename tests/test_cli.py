@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from tiny_clip import digests_of
 
 import weather_aug
-from weather_aug.cli import Export, main, parsed_types
+from weather_aug.cli import main
+from weather_aug.cli.export import Export, parsed_types
 from weather_aug.clip.types import FrameKey
 from weather_aug.render.options import RenderOptions
 from weather_aug.scene.policy import WeatherPolicy

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
@@ -14,11 +15,14 @@ from weather_aug.cli.values import numbers_by_name
 from weather_aug.errors import ArgumentError, OutputError
 
 if TYPE_CHECKING:
+    from weather_aug.scene.scene import WeatherScene
     from weather_aug.writers.balance import ClassBalance
     from weather_aug.writers.plan import ExportPlan
 
 COUNT = 1000
 RARE_SHOWN = 5
+_OF_DRAWS = ("count", "types", "severity", "falling", "balance")
+_AGAINST = {"weather": _OF_DRAWS, "list": ("weather", *_OF_DRAWS, "seed")}
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,9 @@ class Export:
     weather: tuple[str, ...] = ()
     """Every frame in each of these instead of drawn weathers: a type and its severity, "clear",
     "rain=0.3", "rain+fog=heavy"."""
+    list: Path | None = None
+    """Exactly the samples of this JSONL file instead, such as chosen lines of a manifest.jsonl; see
+    `weather_aug.writers.listed`."""
     seeds: int = 1
     """With --weather: how often, each time with other particles; from --seed on."""
     seed: int = 0
@@ -96,41 +103,45 @@ class Export:
 
         Raises:
             ArgumentError: If a flag's value is none.
-            SceneError: If a scene cannot be read.
+            DataError: If a list or a scene cannot be read.
         """
         from weather_aug.scene.policy import WeatherPolicy
-        from weather_aug.scene.scene import WeatherScene
-        from weather_aug.writers.plan import plan_export, plan_grid
+        from weather_aug.writers.plan import plan_export, plan_grid, plan_list
 
+        where: dict[str, Any] = {
+            "layout": self.layout,
+            "parts": self.parts,
+            "split": self.split,
+        }
+        if self.list is not None:
+            return plan_list(self._scenes(), self.list, **where)
         if self.weather:
-            scenes = [WeatherScene.load(path) for path in self.scenes]
             seeds = range(self.seed, self.seed + self.seeds)
-            return plan_grid(
-                *(scenes, self.weather, seeds),
-                layout=self.layout,
-                parts=self.parts,
-                split=self.split,
-            )
+            return plan_grid(self._scenes(), self.weather, seeds, **where)
         policy = WeatherPolicy(parsed_types(self.types), self.severity, self.falling)
         balance = None if self.balance is None else parsed_balance(self.balance)
-        scenes = [WeatherScene.load(path) for path in self.scenes]
         return plan_export(
-            *(scenes, policy),
+            *(self._scenes(), policy),
             count=COUNT if self.count is None else self.count,
             seed=self.seed,
-            layout=self.layout,
-            parts=self.parts,
-            split=self.split,
             balance=balance,
             progress=to_people() and not self.quiet,
+            **where,
         )
+
+    def _scenes(self) -> Sequence[WeatherScene]:
+        from weather_aug.scene.scene import WeatherScene
+
+        return [WeatherScene.load(path) for path in self.scenes]
 
     def _check(self) -> None:
         """Refuse flags that mean nothing together."""
-        drawn = ("count", "types", "severity", "falling", "balance")
-        given = [name for name in drawn if getattr(self, name) != getattr(Export, name)]
-        if self.weather and given:
-            raise ArgumentError(f"--weather does not go with --{given[0]}, which is for draws")
+        for name, others in _AGAINST.items():
+            if getattr(self, name) == getattr(Export, name):
+                continue
+            clash = [other for other in others if getattr(self, other) != getattr(Export, other)]
+            if clash:
+                raise ArgumentError(f"--{name} does not go with --{clash[0]}")
         if self.seeds != Export.seeds and not self.weather:
             raise ArgumentError("--seeds needs --weather; --count says how many samples are drawn")
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from weather_aug.errors import DataError, IntegrityError
+from weather_aug.render.compose import warm_up
 from weather_aug.writers import layout
 from weather_aug.writers.plan import ExportPlan
 from weather_aug.writers.sample import rendered
@@ -44,8 +45,8 @@ class Estimate:
 def estimate(plan: ExportPlan, *, most: int = MOST_SAMPLES, budget_s: float = BUDGET_S) -> Estimate:
     """Render and encode a few samples of a plan as an export does, write nothing, and measure.
 
-    They are spread over the plan by its digest. The first is rendered once more before all, which
-    compiles kernels and opens files.
+    They are spread over the plan by its digest. Before the first all kernels are compiled or loaded
+    and it is rendered once more, which opens files; neither is counted.
 
     Args:
         plan: What would be exported.
@@ -56,6 +57,7 @@ def estimate(plan: ExportPlan, *, most: int = MOST_SAMPLES, budget_s: float = BU
         SceneError: If a scene cannot be read.
     """
     items = spread_items("export-estimate", plan.digest, plan.count, most)
+    warm_up()
     rendered(plan, items[0])
     size = measured = 0
     start_s = time.perf_counter()

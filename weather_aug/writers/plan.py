@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import weather_aug
@@ -25,6 +26,7 @@ from weather_aug.writers import png
 from weather_aug.writers.balance import ClassBalance
 from weather_aug.writers.choices import Choice, FromGrid, FromPolicy, weathers_by_name
 from weather_aug.writers.layout import PARTS, VERSION, Layout, layout_called
+from weather_aug.writers.listed import read_list
 
 MAX_COUNT = 100_000_000
 
@@ -272,6 +274,35 @@ def plan_grid(
     choice = FromGrid(weathers_by_name(weathers), numbers, _chosen_frames(records, keys))
     count = choice.count(len(records))
     return planned(scenes, choice, count, options, layout, parts, split)
+
+
+def plan_list(
+    scenes: Sequence[WeatherScene],
+    path: Path,
+    *,
+    options: RenderOptions = DEFAULT_OPTIONS,
+    layout: str = "cityscapes",
+    parts: Sequence[str] | None = None,
+    split: str = "train",
+) -> ExportPlan:
+    """Plan the samples that a JSONL file lists, in its order.
+
+    Args:
+        scenes: At least one, all that the file names.
+        path: File of lines as `listed` describes; lines of an export's manifest will do.
+        options: Budget of a rendering; not what a manifest's line says.
+        layout: Where files stand, a name of `layout.LAYOUTS`.
+        parts: What a sample consists of, of `layout.PARTS`; the layout's own if None.
+        split: Folder such as train or val.
+
+    Raises:
+        ArgumentError: If there are no scenes, or an argument is out of range.
+        DataError: If the file is no such list.
+        SceneError: If a scene cannot be read.
+    """
+    scenes = _some(scenes)
+    choice = read_list(Path(path), scenes)
+    return planned(scenes, choice, len(choice.samples), options, layout, parts, split)
 
 
 def _chosen_frames(

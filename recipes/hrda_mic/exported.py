@@ -46,22 +46,16 @@ class Reader(NamedTuple):
     ann_dir: str
     img_suffix: str
     seg_map_suffix: str
-    flat: bool
 
 
 READERS = {
-    "cityscapes": Reader(
-        *("CityscapesDataset", "leftImg8bit/{split}", "gtFine/{split}"),
-        *("_leftImg8bit.png", "_gtFine_labelTrainIds.png", False),
-    ),
-    "acdc": Reader(
-        *("ACDCDataset", "rgb_anon/{split}", "gt/{split}"),
-        *("_rgb_anon.png", "_gt_labelTrainIds.png", False),
-    ),
-    "gta": Reader(
-        *("GTADataset", "images", "labels"),
-        *(".png", "_labelTrainIds.png", True),
-    ),
+    layout: Reader(*names.split())
+    for layout, names in {
+        "cityscapes": "CityscapesDataset leftImg8bit/{split} gtFine/{split} "
+        "_leftImg8bit.png _gtFine_labelTrainIds.png",
+        "acdc": "ACDCDataset rgb_anon/{split} gt/{split} _rgb_anon.png _gt_labelTrainIds.png",
+        "gta": "GTADataset images labels .png _labelTrainIds.png",
+    }.items()
 }
 
 

@@ -188,8 +188,8 @@ def test_the_editors_of_backgrounds_are_named(data: Path, tmp_path: Path) -> Non
     editors = [{"editor": "single", "card": card}, {"editor": "instruct-pix2pix", "card": {}}]
     resealed(editors=editors)(data)
     said = run("source", data, checkout_in(tmp_path, "hrda")).stdout
-    assert "the editor single made backgrounds, trained on acdc; do not evaluate" in said
-    assert "trained on pictures that nobody recorded" in said
+    assert "the editor single made backgrounds, trained on acdc: do not evaluate" in said
+    assert "instruct-pix2pix made backgrounds, and its card names no pictures" in said
 
 
 def unfinished(data: Path) -> None:

@@ -95,12 +95,18 @@ def _leakage(exported: Exported) -> list[str]:
             "the export does not record what trained the editor of its backgrounds; if any picture "
             "of ACDC did, do not evaluate on ACDC"
         ]
-    return [
-        f"the editor {editor['editor']} made backgrounds, trained on "
-        f"{', '.join(_pair_lists(editor['card'])) or 'pictures that nobody recorded'}; do not "
-        "evaluate on any of them (trained_on.txt beside its adapter knows each)"
-        for editor in exported.editors
-    ]
+    found = []
+    for editor in exported.editors:
+        lists = ", ".join(_pair_lists(editor["card"]))
+        made = f"the editor {editor['editor']} made backgrounds"
+        found.append(
+            f"{made}, trained on {lists}: do not evaluate on any picture of that (trained_on.txt "
+            "beside its adapter knows each)"
+            if lists
+            else f"{made}, and its card names no pictures that trained it: find out before you "
+            "evaluate on ACDC"
+        )
+    return found
 
 
 def _pair_lists(card: Any) -> list[str]:

@@ -16,12 +16,12 @@ from tyro.conf import Positional
 
 from weather_aug import __version__, _files
 from weather_aug.cli.build import Build
+from weather_aug.cli.export import Export
 from weather_aug.cli.merge import Merge
 from weather_aug.cli.pairs import ListPairs
 from weather_aug.cli.render import Render
 from weather_aug.cli.terminal import check_folder, complain, say, to_people
 from weather_aug.cli.train import TrainEditor
-from weather_aug.cli.values import numbers_by_name
 from weather_aug.cli.view import View
 from weather_aug.errors import (
     ArgumentError,
@@ -82,48 +82,6 @@ class Sweep:
         sheet = draw(scene, key, seed=self.seed, tile_width=self.tile_width, options=options)
         write_png(self.out, sheet)
         say(str(self.out))
-
-
-@dataclass(frozen=True)
-class Export:
-    """Write an offline data set in the Cityscapes layout; run again to continue."""
-
-    scenes: Positional[tuple[Path, ...]]
-    """Scene folders."""
-    out: Path
-    """Folder of the data set."""
-    count: int = 1000
-    """Samples to write."""
-    types: tuple[str, ...] = ("clear=1", "rain=1", "snow=1", "fog=1")
-    """Weather types and how often each is drawn, "type=weight"; "rain+fog=1" is both at once."""
-    severity: tuple[float, float] = (0.1, 1.0)
-    """Range of severities."""
-    falling: float = 0.8
-    """Share of rain and snow that falls."""
-    seed: int = 0
-    """Of all draws."""
-    workers: int = 1
-    """Processes; the result does not depend on it."""
-    verify: bool = False
-    """Compare every byte of what is there already, not only sizes, and repair what differs."""
-
-    def run(self) -> None:
-        """Export and say what was written."""
-        from weather_aug.scene.policy import WeatherPolicy
-        from weather_aug.scene.scene import WeatherScene
-        from weather_aug.writers.export import export
-        from weather_aug.writers.plan import plan_export
-
-        policy = WeatherPolicy(parsed_types(self.types), self.severity, self.falling)
-        scenes = [WeatherScene.load(path) for path in self.scenes]
-        plan = plan_export(scenes, policy, count=self.count, seed=self.seed)
-        report = export(
-            plan, self.out, workers=self.workers, progress=to_people(), verify=self.verify
-        )
-        say(f"{report.samples} samples in {self.out}")
-        unlabelled = report.samples - report.labelled
-        if unlabelled:
-            complain(f"warning: {unlabelled} of {report.samples} samples have no label")
 
 
 @dataclass(frozen=True)
@@ -231,15 +189,6 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(130)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def parsed_types(items: tuple[str, ...]) -> dict[str, float]:
-    """Weights by weather type of texts "type=weight"; what a type is, `WeatherPolicy` decides.
-
-    Raises:
-        ArgumentError: If a text is no type and number, or a type stands twice.
-    """
-    return numbers_by_name("--types", "type=weight, such as rain=2 rain+fog=1", items)
 
 
 def _inspected(path: Path) -> tuple[list[str], str]:

@@ -43,7 +43,8 @@ class WeatherDraw:
     """Of the particles."""
     kind: str
     """Name of the type drawn, as in the policy."""
-    severity: float
+    severity: float | None
+    """In [0, 1]; None of a weather that was not drawn by one."""
 
 
 @dataclass(frozen=True)

@@ -52,10 +52,23 @@ def finish(plan: ExportPlan, target: Target, journal: Journal) -> dict[str, Any]
         "samples_by_kind": dict(sorted(kinds.items())),
         "classes": list(stats.kept),
         "dropped_classes": list(stats.dropped),
+        "editors": _editors(plan),
         "files": {name: _stored(out / name) for name in names},
     }
     _files.write_whole(out / layout.CONTENTS, layout.sealed_contents(contents))
     return contents
+
+
+def _editors(plan: ExportPlan) -> list[dict[str, Any]]:
+    """Editors of the scenes' stored backgrounds, each once; their cards say what trained them."""
+    made: list[dict[str, Any]] = []
+    for scene in plan.scenes:
+        record = scene.manifest.backgrounds
+        if record is not None:
+            editor = {"editor": scene.manifest.editor, "card": dict(record.card)}
+            if editor not in made:
+                made.append(editor)
+    return made
 
 
 def is_finished_whole(

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import re
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import weather_aug
@@ -20,9 +21,12 @@ from weather_aug.render.options import DEFAULT_OPTIONS, RenderOptions
 from weather_aug.scene import store
 from weather_aug.scene.policy import WeatherDraw, WeatherPolicy
 from weather_aug.scene.scene import WeatherScene
+from weather_aug.weather import Weather
 from weather_aug.writers import png
-from weather_aug.writers.choices import Choice, FromPolicy
+from weather_aug.writers.balance import ClassBalance
+from weather_aug.writers.choices import Choice, FromGrid, FromPolicy, weathers_by_name
 from weather_aug.writers.layout import PARTS, VERSION, Layout, layout_called
+from weather_aug.writers.listed import read_list
 
 MAX_COUNT = 100_000_000
 
@@ -208,6 +212,8 @@ def plan_export(
     layout: str = "cityscapes",
     parts: Sequence[str] | None = None,
     split: str = "train",
+    balance: ClassBalance | None = None,
+    progress: bool = False,
 ) -> ExportPlan:
     """Plan `count` samples of `scenes` in weathers drawn from `policy`.
 
@@ -220,13 +226,100 @@ def plan_export(
         layout: Where files stand, a name of `layout.LAYOUTS`.
         parts: What a sample consists of, of `layout.PARTS`; the layout's own if None.
         split: Folder such as train or val.
+        balance: Prefer frames of rare classes; every frame equally often if None. All labels of the
+            scenes are read once.
+        progress: Show a bar while they are.
 
     Raises:
         ArgumentError: If there are no scenes, or an argument is out of range.
         SceneError: If a scene cannot be read.
     """
-    choice = FromPolicy(policy, check_seed("seed", seed))
+    balanced = balance.counted(_some(scenes), progress=progress) if balance else None
+    choice = FromPolicy(policy, check_seed("seed", seed), balanced)
     return planned(scenes, choice, count, options, layout, parts, split)
+
+
+def plan_grid(
+    scenes: Sequence[WeatherScene],
+    weathers: Mapping[str, Weather] | Sequence[str],
+    seeds: Sequence[int] = (0,),
+    *,
+    keys: Sequence[FrameKey] | None = None,
+    options: RenderOptions = DEFAULT_OPTIONS,
+    layout: str = "cityscapes",
+    parts: Sequence[str] | None = None,
+    split: str = "train",
+) -> ExportPlan:
+    """Plan every frame of `scenes` in every one of `weathers` with every one of `seeds`.
+
+    Seeds run fastest, then weathers, then frames by scene, time and camera.
+
+    Args:
+        scenes: At least one; two may share a name.
+        weathers: By name, or texts such as "rain=0.3"; see `choices.weathers_by_name`. A sample's
+            kind in the manifest is the name, its severity is None.
+        seeds: Of the particles, each in [-2**63, 2**64).
+        keys: Frames of each scene; those that it does not have are left out. All if None.
+        options: Budget of a rendering.
+        layout: Where files stand, a name of `layout.LAYOUTS`.
+        parts: What a sample consists of, of `layout.PARTS`; the layout's own if None.
+        split: Folder such as train or val.
+
+    Raises:
+        ArgumentError: If there is no scene, weather or seed, one of them stands twice, no scene has
+            a frame that `keys` names, or an argument is out of range.
+        SceneError: If a scene cannot be read.
+    """
+    scenes = _some(scenes)
+    numbers = tuple(check_seed("seeds", seed) for seed in seeds)
+    if not numbers or len(set(numbers)) != len(numbers):
+        raise ArgumentError("seeds must hold at least one seed, and none twice")
+    records = [record.key for scene in scenes for record in scene.manifest.frames]
+    choice = FromGrid(weathers_by_name(weathers), numbers, _chosen_frames(records, keys))
+    count = choice.count(len(records))
+    return planned(scenes, choice, count, options, layout, parts, split)
+
+
+def plan_list(
+    scenes: Sequence[WeatherScene],
+    path: Path,
+    *,
+    options: RenderOptions = DEFAULT_OPTIONS,
+    layout: str = "cityscapes",
+    parts: Sequence[str] | None = None,
+    split: str = "train",
+) -> ExportPlan:
+    """Plan the samples that a JSONL file lists, in its order.
+
+    Args:
+        scenes: At least one, all that the file names.
+        path: File of lines as `listed` describes; lines of an export's manifest will do.
+        options: Budget of a rendering; not what a manifest's line says.
+        layout: Where files stand, a name of `layout.LAYOUTS`.
+        parts: What a sample consists of, of `layout.PARTS`; the layout's own if None.
+        split: Folder such as train or val.
+
+    Raises:
+        ArgumentError: If there are no scenes, or an argument is out of range.
+        DataError: If the file is no such list.
+        SceneError: If a scene cannot be read.
+    """
+    scenes = _some(scenes)
+    choice = read_list(Path(path), scenes)
+    return planned(scenes, choice, len(choice.samples), options, layout, parts, split)
+
+
+def _chosen_frames(
+    records: Sequence[FrameKey], keys: Sequence[FrameKey] | None
+) -> tuple[int, ...] | None:
+    if keys is None:
+        return None
+    wanted = {FrameKey(*key) for key in keys}
+    missing = sorted(wanted - set(records))
+    if missing or not wanted:
+        which = f"no scene has a frame {missing[0]}" if missing else "it is empty"
+        raise ArgumentError(f"keys: {which}; give keys of the scenes' frames (scene.keys)")
+    return tuple(index for index, key in enumerate(records) if key in wanted)
 
 
 def planned(
@@ -239,9 +332,7 @@ def planned(
     split: str,
 ) -> ExportPlan:
     """A plan of checked arguments; see `plan_export`."""
-    scenes = tuple(scenes)
-    if not scenes:
-        raise ArgumentError("scenes is empty; give at least one scene to export")
+    scenes = _some(scenes)
     if not 1 <= check_seed("count", count) <= MAX_COUNT:
         raise ArgumentError(f"count must be in [1, {MAX_COUNT}], got {count!r}")
     digests = tuple(scene.digest for scene in scenes)
@@ -250,6 +341,12 @@ def planned(
         *(scenes, choice, int(count), options, chosen, _parts_of(parts, chosen)),
         *(_folder_name("split", split), digests),
     )
+
+
+def _some(scenes: Sequence[WeatherScene]) -> tuple[WeatherScene, ...]:
+    if not scenes:
+        raise ArgumentError("scenes is empty; give at least one scene to export")
+    return tuple(scenes)
 
 
 def _parts_of(parts: Sequence[str] | None, layout: Layout) -> tuple[str, ...]:

@@ -1,0 +1,103 @@
+"""What an export will cost, measured on samples that are rendered and encoded as it does."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from weather_aug.scene.scene import WeatherScene
+from weather_aug.writers import estimate as module
+from weather_aug.writers.estimate import Estimate, committed, estimate
+from weather_aug.writers.export import export
+from weather_aug.writers.layout import CONTENTS, JOURNAL
+from weather_aug.writers.plan import ExportPlan, plan_grid
+from weather_aug.writers.sample import Encoded, rendered
+from weather_aug.writers.spread import spread_items
+
+
+def test_bytes_are_those_of_the_export(plan: ExportPlan, tmp_path: Path) -> None:
+    """Of all items the estimate is exact; of three it is near."""
+    written = export(plan, tmp_path / "out").bytes
+    assert estimate(plan, most=10, budget_s=1e9).bytes == written
+    some = estimate(plan, most=3, budget_s=1e9)
+    assert some.measured == 3
+    assert some.bytes == pytest.approx(written, rel=0.2)
+
+
+def test_time_is_the_mean_of_a_sample_and_ends_the_measurement(
+    plan: ExportPlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[int] = []
+
+    def slow(plan: ExportPlan, index: int) -> tuple[dict[str, object], Encoded]:
+        calls.append(index)
+        # The first renders what compiles and opens files: it must not be counted.
+        time.sleep(0.5 if len(calls) == 1 else 0.05)
+        return {}, {"image": b"12345", "label": b"678"}
+
+    monkeypatch.setattr(module, "rendered", slow)
+    cost = estimate(plan, most=4, budget_s=1e9)
+    assert (len(calls), cost.measured) == (5, 4)
+    assert cost.bytes == 10 * 8
+    assert 0.05 <= cost.seconds_per_sample < 0.3
+    assert estimate(plan, most=4, budget_s=0.0).measured == 1
+    assert sorted(set(calls[1:5])) == sorted(calls[1:5])
+
+
+def test_more_processes_take_less_time_up_to_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module.os, "sched_getaffinity", lambda _: {0, 1, 2, 3})
+    cost = Estimate(samples=100, measured=2, bytes_per_sample=1.0, seconds_per_sample=2.0)
+    assert [cost.seconds(workers) for workers in (0, 1, 2, 4, 64)] == [200, 200, 100, 50, 50]
+    assert cost.seconds(2, samples=10) == 10
+
+
+def test_an_estimate_of_a_plan_writes_nothing(scene: WeatherScene, tmp_path: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in scene.path.rglob("*")}
+    estimate(plan_grid([scene], ["clear"]), most=1)
+    assert {path: path.stat().st_mtime_ns for path in scene.path.rglob("*")} == before
+
+
+def test_what_is_there_already_is_counted(plan: ExportPlan, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert committed(out) == 0
+    counts: list[int] = []
+
+    def stop(entry: dict[str, object]) -> None:
+        counts.append(committed(out))
+        if len(counts) == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        export(plan, out, on_sample=stop)
+    assert counts == [1, 2, 3, 4]
+    assert committed(out) == 4
+    with (out / JOURNAL).open("ab") as file:
+        file.write(b"a line cut sho")
+    assert committed(out) == 4
+    export(plan, out)
+    assert committed(out) == 10
+    (out / CONTENTS).write_text("{}")
+    assert committed(out) == 0
+
+
+@given(st.integers(1, 10**8), st.integers(1, 64), st.binary(min_size=8, max_size=8))
+def test_spread_items_are_distinct_and_one_of_each_stretch(
+    count: int, wanted: int, digest: bytes
+) -> None:
+    items = spread_items("test", digest.hex(), count, wanted)
+    wanted = min(wanted, count)
+    assert len(items) == wanted
+    assert spread_items("test", digest.hex(), count, wanted) == items
+    for stretch, item in enumerate(sorted(items)):
+        assert stretch * count // wanted <= item < (stretch + 1) * count // wanted
+
+
+def test_encoder_is_the_exports(plan: ExportPlan) -> None:
+    """A fault planted in the encoder shows in the estimate."""
+    sizes = [sum(len(data) for data in rendered(plan, item)[1].values()) for item in range(10)]
+    cost = estimate(plan, most=10, budget_s=1e9)
+    assert cost.bytes_per_sample == pytest.approx(sum(sizes) / 10)

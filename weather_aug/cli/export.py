@@ -1,0 +1,244 @@
+"""The command that writes an offline data set: what it will be, how it goes, what it became."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tyro.conf import Positional
+
+from weather_aug.cli.terminal import complain, say, to_people
+from weather_aug.cli.values import numbers_by_name
+from weather_aug.errors import ArgumentError, OutputError
+
+if TYPE_CHECKING:
+    from weather_aug.scene.scene import WeatherScene
+    from weather_aug.writers.balance import ClassBalance
+    from weather_aug.writers.plan import ExportPlan
+
+COUNT = 1000
+RARE_SHOWN = 5
+_OF_DRAWS = ("count", "types", "severity", "falling", "balance")
+_AGAINST = {"weather": _OF_DRAWS, "list": ("weather", *_OF_DRAWS, "seed")}
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write an offline data set; run again to continue.
+
+    Says first what it will be, its size and how long it takes; ends with a contact sheet beside the
+    folder and the classes of what was written.
+    """
+
+    scenes: Positional[tuple[Path, ...]]
+    """Scene folders."""
+    out: Path
+    """Folder of the data set."""
+    count: int | None = None
+    """Samples to write of weathers that are drawn; 1000 if not given."""
+    types: tuple[str, ...] = ("clear=1", "rain=1", "snow=1", "fog=1")
+    """Weather types and how often each is drawn, "type=weight"; "rain+fog=1" is both at once."""
+    severity: tuple[float, float] = (0.1, 1.0)
+    """Range of severities."""
+    falling: float = 0.8
+    """Share of rain and snow that falls."""
+    balance: tuple[str, ...] | None = None
+    """Prefer frames of rare classes, as DAFormer's sampling does; the law's numbers may follow,
+    "temperature=0.01" and "min_pixels=3000"."""
+    weather: tuple[str, ...] = ()
+    """Every frame in each of these instead of drawn weathers: a type and its severity, "clear",
+    "rain=0.3", "rain+fog=heavy"."""
+    list: Path | None = None
+    """Exactly the samples of this JSONL file instead, such as chosen lines of a manifest.jsonl; see
+    `weather_aug.writers.listed`."""
+    seeds: int = 1
+    """With --weather: how often, each time with other particles; from --seed on."""
+    seed: int = 0
+    """Of all draws."""
+    layout: str = "cityscapes"
+    """Where files stand: cityscapes, acdc, gta, folders, or webdataset."""
+    parts: tuple[str, ...] | None = None
+    """What a sample consists of: image, label, invalid, transmittance, depth; the layout's choice
+    if not given."""
+    split: str = "train"
+    """Folder such as train or val."""
+    workers: int = 1
+    """Processes; the result does not depend on it."""
+    verify: bool = False
+    """Compare every byte of what is there already, not only sizes, and repair what differs."""
+    dry_run: bool = False
+    """Say what would be written, and write nothing."""
+    quiet: bool = False
+    """Neither summary nor progress, sheet or classes."""
+
+    def run(self) -> None:
+        """Say what will be written, export, and show what was."""
+        from weather_aug.writers.export import export
+
+        self._check()
+        plan = self.plan()
+        if not self.quiet or self.dry_run:
+            self._summarise(plan)
+        if self.dry_run:
+            return
+        report = export(
+            plan,
+            self.out,
+            workers=self.workers,
+            progress=to_people() and not self.quiet,
+            verify=self.verify,
+        )
+        say(f"{report.samples} samples in {self.out}")
+        unlabelled = report.samples - report.labelled
+        if unlabelled and "label" in plan.parts:
+            complain(f"warning: {unlabelled} of {report.samples} samples have no label")
+        if not self.quiet:
+            self._show()
+
+    def plan(self) -> ExportPlan:
+        """What the flags ask for.
+
+        Raises:
+            ArgumentError: If a flag's value is none.
+            DataError: If a list or a scene cannot be read.
+        """
+        from weather_aug.scene.policy import WeatherPolicy
+        from weather_aug.writers.plan import plan_export, plan_grid, plan_list
+
+        where: dict[str, Any] = {
+            "layout": self.layout,
+            "parts": self.parts,
+            "split": self.split,
+        }
+        if self.list is not None:
+            return plan_list(self._scenes(), self.list, **where)
+        if self.weather:
+            seeds = range(self.seed, self.seed + self.seeds)
+            return plan_grid(self._scenes(), self.weather, seeds, **where)
+        policy = WeatherPolicy(parsed_types(self.types), self.severity, self.falling)
+        balance = None if self.balance is None else parsed_balance(self.balance)
+        return plan_export(
+            *(self._scenes(), policy),
+            count=COUNT if self.count is None else self.count,
+            seed=self.seed,
+            balance=balance,
+            progress=to_people() and not self.quiet,
+            **where,
+        )
+
+    def _scenes(self) -> Sequence[WeatherScene]:
+        from weather_aug.scene.scene import WeatherScene
+
+        return [WeatherScene.load(path) for path in self.scenes]
+
+    def _check(self) -> None:
+        """Refuse flags that mean nothing together."""
+        for name, others in _AGAINST.items():
+            if getattr(self, name) == getattr(Export, name):
+                continue
+            clash = [other for other in others if getattr(self, other) != getattr(Export, other)]
+            if clash:
+                raise ArgumentError(f"--{name} does not go with --{clash[0]}")
+        if self.seeds != Export.seeds and not self.weather:
+            raise ArgumentError("--seeds needs --weather; --count says how many samples are drawn")
+
+    def _summarise(self, plan: ExportPlan) -> None:
+        from weather_aug.writers.choices import FromPolicy
+        from weather_aug.writers.estimate import committed, estimate
+        from weather_aug.writers.lock import check_output
+
+        check_output(self.out, [scene.path for scene in plan.scenes])
+        frames = sum(len(scene.keys) for scene in plan.scenes)
+        of = "scene" if len(plan.scenes) == 1 else "scenes"
+        say(f"plan     {plan.count} samples of {frames} frames in {len(plan.scenes)} {of}")
+        say(f"weather  {_shares(plan.choice.shares())}")
+        if isinstance(plan.choice, FromPolicy) and plan.choice.balance is not None:
+            rare = list(plan.choice.balance.shares().items())[:RARE_SHOWN]
+            say(f"classes  frames are chosen for {_shares(dict(rare))}")
+        engine = "this process" if self.workers <= 1 else f"{self.workers} processes"
+        say(f"layout   {plan.layout.name}, {plan.split}: {', '.join(plan.parts)}; by {engine}")
+        done = committed(self.out)
+        if done >= plan.count:
+            say("time     all samples are there already")
+            return
+        cost = estimate(plan)
+        there = f"; {done} samples are there already" if done else ""
+        say(
+            f"size     about {told_bytes(cost.bytes)}, {told_bytes(cost.bytes_per_sample)} a sample"
+        )
+        say(
+            f"time     about {told_seconds(cost.seconds(self.workers, plan.count - done))}, "
+            f"{cost.seconds_per_sample:.2g} s a sample ({cost.measured} measured){there}"
+        )
+
+    def _show(self) -> None:
+        """Classes and a contact sheet of what stands on disk."""
+        from weather_aug.view.histogram import class_bars
+        from weather_aug.view.sheet import write_png
+        from weather_aug.writers.written import read_written, written_sheet
+
+        written = read_written(self.out)
+        if written.shares is not None:
+            say(f"share of pixels by class, {written.counted} of {written.labelled} labels:")
+            for line in class_bars(written.shares, colour=sys.stdout.isatty()):
+                say(line)
+        path = self.out.absolute()
+        sheet = path.with_name(f"{path.name}.png")
+        try:
+            write_png(sheet, written_sheet(self.out, written))
+        except OutputError as error:
+            # The data set itself is whole; its folder may be all that can be written.
+            complain(f"warning: no contact sheet: {error}")
+            return
+        say("look at")
+        say(str(self.out.with_name(sheet.name) if self.out.name else sheet))
+
+
+def parsed_types(items: tuple[str, ...]) -> dict[str, float]:
+    """Weights by weather type of texts "type=weight"; what a type is, `WeatherPolicy` decides.
+
+    Raises:
+        ArgumentError: If a text is no type and number, or a type stands twice.
+    """
+    return numbers_by_name("--types", "type=weight, such as rain=2 rain+fog=1", items)
+
+
+def parsed_balance(items: tuple[str, ...]) -> ClassBalance:
+    """The balance of texts "name=number"; none stands for the defaults.
+
+    Raises:
+        ArgumentError: If a text is no name and number, or there is no such name.
+    """
+    from weather_aug.writers.balance import ClassBalance
+
+    form = "temperature=0.01 and min_pixels=3000"
+    numbers = numbers_by_name("--balance", form, items)
+    if not set(numbers) <= {"temperature", "min_pixels"}:
+        raise ArgumentError(f"--balance takes {form}, got {', '.join(numbers)}")
+    return ClassBalance(**numbers)  # type: ignore[arg-type]
+
+
+def told_bytes(count: float) -> str:
+    """A size in the unit, of 1000s, that people would take, to three digits."""
+    units = ["B", "kB", "MB", "GB", "TB"]
+    while count >= 999.5 and units[1:]:
+        count, units = count / 1000, units[1:]
+    return f"{count:.3g} {units[0]}"
+
+
+def told_seconds(seconds: float) -> str:
+    """A time in the unit that people would take, to two digits."""
+    for unit, size in (("days", 86_400), ("h", 3600), ("min", 60)):
+        value = seconds / size
+        if value >= 2:
+            return f"{value:.0f} {unit}" if value >= 9.95 else f"{value:.1f} {unit}"
+    return f"{max(1, round(seconds))} s"
+
+
+def _shares(shares: dict[str, float]) -> str:
+    from weather_aug.view.histogram import percent
+
+    return ", ".join(f"{name} {percent(share)}" for name, share in shares.items())

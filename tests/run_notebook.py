@@ -12,7 +12,7 @@ from jupyter_client.kernelspec import KernelSpecManager
 from jupyter_client.manager import AsyncKernelManager
 from nbclient import NotebookClient
 
-CELL_S = 60
+CELL_S = 300
 
 
 def main(source: str, out: str) -> None:

@@ -27,7 +27,7 @@ RUNNER = Path(__file__).parent / "run_notebook.py"
 FOLDER = Path(__file__).parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 NAMES = ["01_severity_sweep", "02_drop_into_dataloader", "03_export"]
-LONGEST_S = 60.0
+LONGEST_S = 300.0
 PNG = b"\x89PNG\r\n\x1a\n"
 
 Cell = dict[str, Any]

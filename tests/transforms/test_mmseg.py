@@ -201,7 +201,7 @@ def wrong(name: str) -> Results:
         ("no picture", "after LoadImageFromFile"),
         ("channels first", "shape"),
         ("normalised", "before normalisation"),
-        ("loaded with to_float32", "before normalisation"),
+        ("loaded with to_float32", "divide it by 255, or keep uint8"),
         ("flipped", "before RandomFlip"),
         ("another label", "mask"),
         ("depth in the first size", "depth"),

@@ -51,7 +51,7 @@ def test_summary_result_classes_and_sheet(
     assert re.fullmatch(r"size     about [\d.]+ kB, [\d.]+ kB a sample", lines[3])
     assert re.fullmatch(r"time     about \d+ s, \S+ s a sample \(\d measured\)", lines[4])
     assert lines[5] == f"6 samples in {out}"
-    assert lines[6] == "share of pixels by class, 6 of 6 labels:"
+    assert lines[6] == "share of pixels by class, 6 of 6 labels; bars are logarithmic:"
     assert "road" in lines[7]
     assert lines[-2:] == ["look at", f"{out}.png"]
     # The sheet is no part of the export.
@@ -118,6 +118,30 @@ def test_a_grid_of_weathers(tiny_scene: WeatherScene, tmp_path: Path, capsys: Ca
     assert [recipe["seed"] for recipe in recipes[:4]] == [9, 10, 9, 10]
     kinds = json.loads((out / "export.json").read_text())["samples_by_kind"]
     assert kinds == {"clear": 16, "rain+fog=0.4": 16}
+
+
+def test_a_list_of_samples(tiny_scene: WeatherScene, tmp_path: Path, capsys: Captured) -> None:
+    """Lines of one export's manifest, in another layout: the same pictures."""
+    first, second = tmp_path / "first", tmp_path / "second"
+    main(f"export {tiny_scene.path} --out {first} --count 5 --quiet".split())
+    lines = (first / "manifest.jsonl").read_text().splitlines()
+    (tmp_path / "list.jsonl").write_text("\n".join([lines[3], lines[1]]))
+    capsys.readouterr()
+    main(
+        f"export {tiny_scene.path} --out {second} --list {tmp_path / 'list.jsonl'} "
+        "--layout folders".split()
+    )
+    assert capsys.readouterr().out.startswith("plan     2 samples of 8 frames")
+    again = [json.loads(line) for line in (second / "manifest.jsonl").open()]
+    for entry, line in zip(again, (lines[3], lines[1]), strict=True):
+        expected = json.loads(line)
+        assert entry["recipe"] == expected["recipe"]
+        for part in ("image", "label"):
+            assert entry["files"][part]["sha256"] == expected["files"][part]["sha256"]
+    missing = tmp_path / "missing.jsonl"
+    command = f"export {tiny_scene.path} --out {tmp_path / 'no'} --list {missing}"
+    code, line = refused(command.split(), capsys)
+    assert (code, "cannot read" in line) == (3, True), line
 
 
 def test_layout_parts_and_split(tiny_scene: WeatherScene, tmp_path: Path, capsys: Captured) -> None:
@@ -198,6 +222,8 @@ def test_a_sheet_that_cannot_be_written_is_a_warning(
         ("--weather rain --count 5", "--weather does not go with --count"),
         ("--weather rain --types rain=1", "--weather does not go with --types"),
         ("--weather rain --balance", "--weather does not go with --balance"),
+        ("--list a.jsonl --weather rain", "--list does not go with --weather"),
+        ("--list a.jsonl --seed 3", "--list does not go with --seed"),
         ("--weather hail", "'hail'"),
         ("--weather rain rain", "stands twice"),
         ("--weather rain --seeds 0", "seeds"),

@@ -182,7 +182,8 @@ class Export:
 
         written = read_written(self.out)
         if written.shares is not None:
-            say(f"share of pixels by class, {written.counted} of {written.labelled} labels:")
+            labels = f"{written.counted} of {written.labelled} labels"
+            say(f"share of pixels by class, {labels}; bars are logarithmic:")
             for line in class_bars(written.shares, colour=sys.stdout.isatty()):
                 say(line)
         path = self.out.absolute()

@@ -1,4 +1,4 @@
-"""The command line: demo, build, render, sweep, export, view, inspect, list-pairs, train-editor."""
+"""The command line; `Command` lists what it can do."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from tyro.conf import Positional
 from weather_aug import __version__, _files
 from weather_aug.cli.build import Build
 from weather_aug.cli.export import Export
+from weather_aug.cli.merge import Merge
 from weather_aug.cli.pairs import ListPairs
 from weather_aug.cli.render import Render
 from weather_aug.cli.terminal import check_folder, complain, say, to_people
@@ -156,6 +157,7 @@ Command = (
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Sweep, tyro.conf.subcommand("sweep")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Merge, tyro.conf.subcommand("merge")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Inspect, tyro.conf.subcommand("inspect")]
     | Annotated[ListPairs, tyro.conf.subcommand("list-pairs")]

@@ -77,9 +77,13 @@ class Export:
     def run(self) -> None:
         """Say what will be written, export, and show what was."""
         from weather_aug.writers.export import export
+        from weather_aug.writers.lock import check_output
 
         self._check()
         plan = self.plan()
+        if not self.dry_run:
+            # Before anything is measured for a folder that will be refused.
+            check_output(self.out, [scene.path for scene in plan.scenes])
         if not self.quiet or self.dry_run:
             self._summarise(plan)
         if self.dry_run:
@@ -148,9 +152,7 @@ class Export:
     def _summarise(self, plan: ExportPlan) -> None:
         from weather_aug.writers.choices import FromPolicy
         from weather_aug.writers.estimate import committed, estimate
-        from weather_aug.writers.lock import check_output
 
-        check_output(self.out, [scene.path for scene in plan.scenes])
         frames = sum(len(scene.keys) for scene in plan.scenes)
         of = "scene" if len(plan.scenes) == 1 else "scenes"
         say(f"plan     {plan.count} samples of {frames} frames in {len(plan.scenes)} {of}")

@@ -235,6 +235,8 @@ def _known_stats(root: Path) -> dict[str, dict[str, int]]:
         return {}
     rows = _files.read_json(path, MAX_STATS_BYTES)
     try:
+        if not isinstance(rows, list):
+            raise TypeError
         known = {Path(row["file"]).name: _checked_pixels(row) for row in rows}
     except (KeyError, TypeError, ValueError, AttributeError):
         raise DataError(
@@ -265,9 +267,9 @@ def _source_of_export(export: Path) -> _Source:
         ) from None
     job = contents["job"]
     for name, wanted in (("layout", "cityscapes"), ("split", SPLIT)):
-        if job.get(name) != wanted:
+        if (found := job.get(name)) != wanted:
             raise ArgumentError(
-                f"{shown} has the {name} {printable(job.get(name))}; a labelled source needs {wanted}"
+                f"{shown} has the {name} {printable(found)}; a labelled source needs {wanted}"
             )
     if contents["labelled"] != contents["samples"]:
         raise ArgumentError(

@@ -110,7 +110,7 @@ class ExportPlan:
         jobs are merged or two scenes share a name.
         """
         scene_index, record, _ = self._chosen(index)
-        return f"{self.scenes[scene_index].name}_{self.digest[:8]}_{index:06d}_{record.key}"
+        return self._base(index, self.scenes[scene_index].name, record.key)
 
     def files(self, index: int) -> dict[str, str]:
         """Relative paths of the files that hold an item: one a part, or the tar of its unit."""
@@ -125,7 +125,8 @@ class ExportPlan:
         Where items stand in tars, names of members.
         """
         scene_index, record, _ = self._chosen(index)
-        scene, base = self.scenes[scene_index].name, self.base(index)
+        scene = self.scenes[scene_index].name
+        base = self._base(index, scene, record.key)
         return {
             part: self.layout.path(part, split=self.split, scene=scene, base=base)
             for part in self.parts
@@ -184,6 +185,9 @@ class ExportPlan:
                     f"scene {printable(scene.path, 200)} was rebuilt since the export was planned; "
                     "export it again, to another folder"
                 )
+
+    def _base(self, index: int, scene: str, key: FrameKey) -> str:
+        return f"{scene}_{self.digest[:8]}_{index:06d}_{key}"
 
     def _chosen(self, index: int) -> tuple[int, store.FrameRecord, WeatherDraw]:
         if not 0 <= index < self.count:

@@ -53,7 +53,7 @@ def _unfinished(out: Path) -> str:
 def _problems_of_samples(out: Path, contents: dict[str, Any], expected: set[str]) -> list[str]:
     """Check every line of the manifest and the files that it names, which join `expected`."""
     problems: list[str] = []
-    items_per_unit = max(1, int(contents["job"]["items_per_unit"]))
+    items_per_unit = max(1, int(contents["job"].get("items_per_unit", 1)))
     tar: dict[str, Any] | None = None
     lines = labels = 0
     for lines, line in enumerate(_lines(out), 1):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,6 +25,10 @@ Captured = pytest.CaptureFixture[str]
 def job_of(out: Path) -> dict[str, object]:
     job: dict[str, object] = json.loads((out / "export.json").read_text())["job"]
     return job
+
+
+def entries_of(out: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]
 
 
 def refused(arguments: list[str], capsys: Captured) -> tuple[int, str]:
@@ -49,7 +54,7 @@ def test_summary_result_classes_and_sheet(
         "layout   cityscapes, train: image, label; by this process",
     ]
     assert re.fullmatch(r"size     about [\d.]+ kB, [\d.]+ kB a sample", lines[3])
-    assert re.fullmatch(r"time     about \d+ s, \S+ s a sample \(\d measured\)", lines[4])
+    assert re.fullmatch(r"time     about \d+ s, \S+ s a sample \(\d+ measured\)", lines[4])
     assert lines[5] == f"6 samples in {out}"
     assert lines[6] == "share of pixels by class, 6 of 6 labels; bars are logarithmic:"
     assert "road" in lines[7]
@@ -114,7 +119,7 @@ def test_a_grid_of_weathers(tiny_scene: WeatherScene, tmp_path: Path, capsys: Ca
         "plan     32 samples of 8 frames in 1 scene",
         "weather  clear 50 %, rain+fog=0.4 50 %",
     ]
-    recipes = [json.loads(line)["recipe"] for line in (out / "manifest.jsonl").open()]
+    recipes = [entry["recipe"] for entry in entries_of(out)]
     assert [recipe["seed"] for recipe in recipes[:4]] == [9, 10, 9, 10]
     kinds = json.loads((out / "export.json").read_text())["samples_by_kind"]
     assert kinds == {"clear": 16, "rain+fog=0.4": 16}
@@ -132,7 +137,7 @@ def test_a_list_of_samples(tiny_scene: WeatherScene, tmp_path: Path, capsys: Cap
         "--layout folders".split()
     )
     assert capsys.readouterr().out.startswith("plan     2 samples of 8 frames")
-    again = [json.loads(line) for line in (second / "manifest.jsonl").open()]
+    again = entries_of(second)
     for entry, line in zip(again, (lines[3], lines[1]), strict=True):
         expected = json.loads(line)
         assert entry["recipe"] == expected["recipe"]

@@ -17,11 +17,11 @@ from weather_aug.writers.plan import ExportPlan
 from weather_aug.writers.sample import rendered
 from weather_aug.writers.spread import spread_items
 
-MOST_SAMPLES = 8
+MOST_SAMPLES = 32
 BUDGET_S = 2.0
 """No further sample is begun when the first ones have taken as long."""
 _CANDIDATES = 256
-"""Items among which one of each weather is looked for."""
+"""Items among which each weather is looked for; of fewer items the weathers are counted."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ def estimate(plan: ExportPlan, *, most: int = MOST_SAMPLES, budget_s: float = BU
     """Render and encode a few samples of a plan as an export does, write nothing, and measure.
 
     Samples are spread over the plan by its digest, weathers in turn, and each weather counts by its
-    share: a snowfall is several times as large and as slow as a clear day. Before the first all
-    kernels are compiled or loaded and it is rendered once more, which opens files; neither is
-    counted.
+    share, of a small plan by how often it comes: a snowfall is several times as large and as slow
+    as a clear day. Before the first all kernels are compiled or loaded and it is rendered once
+    more, which opens files; neither is counted.
 
     Args:
         plan: What would be exported.
@@ -63,7 +63,8 @@ def estimate(plan: ExportPlan, *, most: int = MOST_SAMPLES, budget_s: float = BU
     Raises:
         SceneError: If a scene cannot be read.
     """
-    items = _in_turn(plan)[:most]
+    turns = _in_turn(plan)
+    items = turns[:most]
     kinds = {kind for _, kind in items}
     warm_up()
     rendered(plan, items[0][0])
@@ -73,14 +74,10 @@ def estimate(plan: ExportPlan, *, most: int = MOST_SAMPLES, budget_s: float = BU
         if len(costs) == len(kinds) and time.perf_counter() - start_s >= budget_s:
             break
         costs.setdefault(kind, []).append(_cost(plan, item))
-    shares = plan.choice.shares()
-    weights = [shares[kind] for kind in costs]
-    size, seconds = np.average(
-        [np.mean(costs_of_kind, axis=0) for costs_of_kind in costs.values()],
-        axis=0,
-        weights=weights,
-    )
-    measured = sum(len(costs_of_kind) for costs_of_kind in costs.values())
+    shares = plan.choice.shares() if plan.count > _CANDIDATES else Counter(k for _, k in turns)
+    means = [np.mean(some, axis=0) for some in costs.values()]
+    size, seconds = np.average(means, axis=0, weights=[shares[kind] for kind in costs])
+    measured = sum(map(len, costs.values()))
     return Estimate(plan.count, measured, float(size), float(seconds))
 
 

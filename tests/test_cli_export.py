@@ -210,6 +210,25 @@ def test_what_is_there_already_is_not_measured_again(
     assert "time     all samples are there already\n" in capsys.readouterr().out
 
 
+def test_damage_that_is_seen_is_a_warning_with_its_cure(
+    tiny_scene: WeatherScene, tmp_path: Path, capsys: Captured
+) -> None:
+    out = tmp_path / "data"
+    command = f"export {tiny_scene.path} --out {out} --count 1".split()
+    main(command)
+    (victim,) = out.rglob("*TrainIds.png")
+    data = bytearray(victim.read_bytes())
+    data[-20] ^= 1
+    victim.write_bytes(data)
+    capsys.readouterr()
+    main(command)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("weather-aug: warning: ")
+    assert line.endswith("; run the same export again with --verify to repair it")
+    main([*command, "--verify"])
+    assert capsys.readouterr().err == ""
+
+
 def test_a_sheet_that_cannot_be_written_is_a_warning(
     tiny_scene: WeatherScene, tmp_path: Path, capsys: Captured
 ) -> None:

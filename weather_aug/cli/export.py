@@ -12,7 +12,7 @@ from tyro.conf import Positional
 
 from weather_aug.cli.terminal import complain, say, to_people
 from weather_aug.cli.values import numbers_by_name
-from weather_aug.errors import ArgumentError, OutputError
+from weather_aug.errors import ArgumentError, IntegrityError, OutputError
 
 if TYPE_CHECKING:
     from weather_aug.scene.scene import WeatherScene
@@ -182,20 +182,24 @@ class Export:
         from weather_aug.view.sheet import write_png
         from weather_aug.writers.written import read_written, written_sheet
 
-        written = read_written(self.out)
+        path = self.out.absolute()
+        sheet = path.with_name(f"{path.name}.png")
+        try:
+            written = read_written(self.out)
+            picture = written_sheet(self.out, written)
+            write_png(sheet, picture)
+        except IntegrityError as error:
+            complain(f"warning: {error}; run the same export again with --verify to repair it")
+            return
+        except OutputError as error:
+            # The data set itself is whole; its folder may be all that can be written.
+            complain(f"warning: no contact sheet: {error}")
+            return
         if written.shares is not None:
             labels = f"{written.counted} of {written.labelled} labels"
             say(f"share of pixels by class, {labels}; bars are logarithmic:")
             for line in class_bars(written.shares, colour=sys.stdout.isatty()):
                 say(line)
-        path = self.out.absolute()
-        sheet = path.with_name(f"{path.name}.png")
-        try:
-            write_png(sheet, written_sheet(self.out, written))
-        except OutputError as error:
-            # The data set itself is whole; its folder may be all that can be written.
-            complain(f"warning: no contact sheet: {error}")
-            return
         say("look at")
         say(str(self.out.with_name(sheet.name) if self.out.name else sheet))
 

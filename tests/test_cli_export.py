@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,6 +25,10 @@ Captured = pytest.CaptureFixture[str]
 def job_of(out: Path) -> dict[str, object]:
     job: dict[str, object] = json.loads((out / "export.json").read_text())["job"]
     return job
+
+
+def entries_of(out: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]
 
 
 def refused(arguments: list[str], capsys: Captured) -> tuple[int, str]:
@@ -49,9 +54,9 @@ def test_summary_result_classes_and_sheet(
         "layout   cityscapes, train: image, label; by this process",
     ]
     assert re.fullmatch(r"size     about [\d.]+ kB, [\d.]+ kB a sample", lines[3])
-    assert re.fullmatch(r"time     about \d+ s, \S+ s a sample \(\d measured\)", lines[4])
+    assert re.fullmatch(r"time     about \d+ s, \S+ s a sample \(\d+ measured\)", lines[4])
     assert lines[5] == f"6 samples in {out}"
-    assert lines[6] == "share of pixels by class, 6 of 6 labels:"
+    assert lines[6] == "share of pixels by class, 6 of 6 labels; bars are logarithmic:"
     assert "road" in lines[7]
     assert lines[-2:] == ["look at", f"{out}.png"]
     # The sheet is no part of the export.
@@ -114,10 +119,34 @@ def test_a_grid_of_weathers(tiny_scene: WeatherScene, tmp_path: Path, capsys: Ca
         "plan     32 samples of 8 frames in 1 scene",
         "weather  clear 50 %, rain+fog=0.4 50 %",
     ]
-    recipes = [json.loads(line)["recipe"] for line in (out / "manifest.jsonl").open()]
+    recipes = [entry["recipe"] for entry in entries_of(out)]
     assert [recipe["seed"] for recipe in recipes[:4]] == [9, 10, 9, 10]
     kinds = json.loads((out / "export.json").read_text())["samples_by_kind"]
     assert kinds == {"clear": 16, "rain+fog=0.4": 16}
+
+
+def test_a_list_of_samples(tiny_scene: WeatherScene, tmp_path: Path, capsys: Captured) -> None:
+    """Lines of one export's manifest, in another layout: the same pictures."""
+    first, second = tmp_path / "first", tmp_path / "second"
+    main(f"export {tiny_scene.path} --out {first} --count 5 --quiet".split())
+    lines = (first / "manifest.jsonl").read_text().splitlines()
+    (tmp_path / "list.jsonl").write_text("\n".join([lines[3], lines[1]]))
+    capsys.readouterr()
+    main(
+        f"export {tiny_scene.path} --out {second} --list {tmp_path / 'list.jsonl'} "
+        "--layout folders".split()
+    )
+    assert capsys.readouterr().out.startswith("plan     2 samples of 8 frames")
+    again = entries_of(second)
+    for entry, line in zip(again, (lines[3], lines[1]), strict=True):
+        expected = json.loads(line)
+        assert entry["recipe"] == expected["recipe"]
+        for part in ("image", "label"):
+            assert entry["files"][part]["sha256"] == expected["files"][part]["sha256"]
+    missing = tmp_path / "missing.jsonl"
+    command = f"export {tiny_scene.path} --out {tmp_path / 'no'} --list {missing}"
+    code, line = refused(command.split(), capsys)
+    assert (code, "cannot read" in line) == (3, True), line
 
 
 def test_layout_parts_and_split(tiny_scene: WeatherScene, tmp_path: Path, capsys: Captured) -> None:
@@ -181,6 +210,25 @@ def test_what_is_there_already_is_not_measured_again(
     assert "time     all samples are there already\n" in capsys.readouterr().out
 
 
+def test_damage_that_is_seen_is_a_warning_with_its_cure(
+    tiny_scene: WeatherScene, tmp_path: Path, capsys: Captured
+) -> None:
+    out = tmp_path / "data"
+    command = f"export {tiny_scene.path} --out {out} --count 1".split()
+    main(command)
+    (victim,) = out.rglob("*TrainIds.png")
+    data = bytearray(victim.read_bytes())
+    data[-20] ^= 1
+    victim.write_bytes(data)
+    capsys.readouterr()
+    main(command)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("weather-aug: warning: ")
+    assert line.endswith("; run the same export again with --verify to repair it")
+    main([*command, "--verify"])
+    assert capsys.readouterr().err == ""
+
+
 def test_a_sheet_that_cannot_be_written_is_a_warning(
     tiny_scene: WeatherScene, tmp_path: Path, capsys: Captured
 ) -> None:
@@ -198,6 +246,8 @@ def test_a_sheet_that_cannot_be_written_is_a_warning(
         ("--weather rain --count 5", "--weather does not go with --count"),
         ("--weather rain --types rain=1", "--weather does not go with --types"),
         ("--weather rain --balance", "--weather does not go with --balance"),
+        ("--list a.jsonl --weather rain", "--list does not go with --weather"),
+        ("--list a.jsonl --seed 3", "--list does not go with --seed"),
         ("--weather hail", "'hail'"),
         ("--weather rain rain", "stands twice"),
         ("--weather rain --seeds 0", "seeds"),

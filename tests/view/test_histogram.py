@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from weather_aug.errors import ArgumentError
@@ -67,6 +67,7 @@ def test_percent_has_two_digits_that_count(share: float, text: str) -> None:
     assert percent(0.0) == "none"
 
 
+@settings(max_examples=25)
 @given(st.lists(st.integers(0, 10**12), min_size=256, max_size=256).filter(any))
 def test_any_counts_can_be_drawn(numbers: list[int]) -> None:
     shares = pixel_shares(np.array(numbers))

@@ -12,7 +12,7 @@ from tyro.conf import Positional
 
 from weather_aug.cli.terminal import complain, say, to_people
 from weather_aug.cli.values import numbers_by_name
-from weather_aug.errors import ArgumentError, OutputError
+from weather_aug.errors import ArgumentError, IntegrityError, OutputError
 
 if TYPE_CHECKING:
     from weather_aug.scene.scene import WeatherScene
@@ -77,9 +77,13 @@ class Export:
     def run(self) -> None:
         """Say what will be written, export, and show what was."""
         from weather_aug.writers.export import export
+        from weather_aug.writers.lock import check_output
 
         self._check()
         plan = self.plan()
+        if not self.dry_run:
+            # Before anything is measured for a folder that will be refused.
+            check_output(self.out, [scene.path for scene in plan.scenes])
         if not self.quiet or self.dry_run:
             self._summarise(plan)
         if self.dry_run:
@@ -148,9 +152,7 @@ class Export:
     def _summarise(self, plan: ExportPlan) -> None:
         from weather_aug.writers.choices import FromPolicy
         from weather_aug.writers.estimate import committed, estimate
-        from weather_aug.writers.lock import check_output
 
-        check_output(self.out, [scene.path for scene in plan.scenes])
         frames = sum(len(scene.keys) for scene in plan.scenes)
         of = "scene" if len(plan.scenes) == 1 else "scenes"
         say(f"plan     {plan.count} samples of {frames} frames in {len(plan.scenes)} {of}")
@@ -180,19 +182,24 @@ class Export:
         from weather_aug.view.sheet import write_png
         from weather_aug.writers.written import read_written, written_sheet
 
-        written = read_written(self.out)
-        if written.shares is not None:
-            say(f"share of pixels by class, {written.counted} of {written.labelled} labels:")
-            for line in class_bars(written.shares, colour=sys.stdout.isatty()):
-                say(line)
         path = self.out.absolute()
         sheet = path.with_name(f"{path.name}.png")
         try:
-            write_png(sheet, written_sheet(self.out, written))
+            written = read_written(self.out)
+            picture = written_sheet(self.out, written)
+            write_png(sheet, picture)
+        except IntegrityError as error:
+            complain(f"warning: {error}; run the same export again with --verify to repair it")
+            return
         except OutputError as error:
             # The data set itself is whole; its folder may be all that can be written.
             complain(f"warning: no contact sheet: {error}")
             return
+        if written.shares is not None:
+            labels = f"{written.counted} of {written.labelled} labels"
+            say(f"share of pixels by class, {labels}; bars are logarithmic:")
+            for line in class_bars(written.shares, colour=sys.stdout.isatty()):
+                say(line)
         say("look at")
         say(str(self.out.with_name(sheet.name) if self.out.name else sheet))
 

@@ -62,7 +62,7 @@ def class_histogram(shares: dict[str, float], *, width: int = 960, title: str = 
     for tick in _TICKS:
         x = left + _place(tick) * (right - left)
         draw.line((x, _HEADER_PX - 4, x, height - 8), fill=_RULE)
-        draw.text((x, _HEADER_PX - 6), f"{tick:.4g}", fill=_INK, font=font, anchor="ms")
+        draw.text((x, _HEADER_PX - 6), f"{100 * tick:g} %", fill=_INK, font=font, anchor="ms")
     for row, (name, share) in enumerate(shares.items()):
         top = _HEADER_PX + row * _ROW_PX
         middle = top + _ROW_PX / 2

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import time
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from weather_aug.errors import DataError, IntegrityError
 from weather_aug.render.compose import warm_up
@@ -14,14 +17,16 @@ from weather_aug.writers.plan import ExportPlan
 from weather_aug.writers.sample import rendered
 from weather_aug.writers.spread import spread_items
 
-MOST_SAMPLES = 8
+MOST_SAMPLES = 32
 BUDGET_S = 2.0
 """No further sample is begun when the first ones have taken as long."""
+_CANDIDATES = 256
+"""Items among which each weather is looked for; of fewer items the weathers are counted."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What an export will cost, by the mean of its measured samples."""
+    """What an export will cost, by its measured samples."""
 
     samples: int
     """In the plan."""
@@ -45,30 +50,53 @@ class Estimate:
 def estimate(plan: ExportPlan, *, most: int = MOST_SAMPLES, budget_s: float = BUDGET_S) -> Estimate:
     """Render and encode a few samples of a plan as an export does, write nothing, and measure.
 
-    They are spread over the plan by its digest. Before the first all kernels are compiled or loaded
-    and it is rendered once more, which opens files; neither is counted.
+    Samples are spread over the plan by its digest, weathers in turn, and each weather counts by its
+    share, of a small plan by how often it comes: a snowfall is several times as large and as slow
+    as a clear day. Before the first all kernels are compiled or loaded and it is rendered once
+    more, which opens files; neither is counted.
 
     Args:
         plan: What would be exported.
         most: Samples to measure at most, 1 or more; no more than the plan has.
-        budget_s: No further sample is begun after as many seconds.
+        budget_s: No further sample is begun after as many seconds, but each weather had one.
 
     Raises:
         SceneError: If a scene cannot be read.
     """
-    items = spread_items("export-estimate", plan.digest, plan.count, most)
+    turns = _in_turn(plan)
+    items = turns[:most]
+    kinds = {kind for _, kind in items}
     warm_up()
-    rendered(plan, items[0])
-    size = measured = 0
+    rendered(plan, items[0][0])
+    costs: dict[str, list[tuple[int, float]]] = {}
     start_s = time.perf_counter()
-    for item in items:
-        _, parts = rendered(plan, item)
-        size += sum(len(data) for data in parts.values())
-        measured += 1
-        if time.perf_counter() - start_s >= budget_s:
+    for item, kind in items:
+        if len(costs) == len(kinds) and time.perf_counter() - start_s >= budget_s:
             break
-    seconds = time.perf_counter() - start_s
-    return Estimate(plan.count, measured, size / measured, seconds / measured)
+        costs.setdefault(kind, []).append(_cost(plan, item))
+    shares = plan.choice.shares() if plan.count > _CANDIDATES else Counter(k for _, k in turns)
+    means = [np.mean(some, axis=0) for some in costs.values()]
+    size, seconds = np.average(means, axis=0, weights=[shares[kind] for kind in costs])
+    measured = sum(map(len, costs.values()))
+    return Estimate(plan.count, measured, float(size), float(seconds))
+
+
+def _in_turn(plan: ExportPlan) -> list[tuple[int, str]]:
+    """Some items and their weathers: one of each weather, then a second of each, and so on."""
+    seen: Counter[str] = Counter()
+    turns = []
+    for item in spread_items("export-estimate", plan.digest, plan.count, _CANDIDATES):
+        kind = plan.item(item).draw.kind
+        turns.append((seen[kind], item, kind))
+        seen[kind] += 1
+    return [(item, kind) for _, item, kind in sorted(turns, key=lambda turn: turn[0])]
+
+
+def _cost(plan: ExportPlan, item: int) -> tuple[int, float]:
+    """Bytes and seconds of one sample."""
+    start_s = time.perf_counter()
+    _, parts = rendered(plan, item)
+    return sum(len(data) for data in parts.values()), time.perf_counter() - start_s
 
 
 def committed(out: Path) -> int:

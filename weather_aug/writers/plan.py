@@ -29,6 +29,7 @@ from weather_aug.writers.layout import PARTS, VERSION, Layout, layout_called
 from weather_aug.writers.listed import read_list
 
 MAX_COUNT = 100_000_000
+MAX_SEEDS = 1_000_000
 
 
 class PlannedItem(NamedTuple):
@@ -271,9 +272,11 @@ def plan_grid(
         SceneError: If a scene cannot be read.
     """
     scenes = _some(scenes)
+    if not 1 <= len(seeds) <= MAX_SEEDS:
+        raise ArgumentError(f"seeds must be 1 to {MAX_SEEDS} numbers, got {len(seeds)}")
     numbers = tuple(check_seed("seeds", seed) for seed in seeds)
-    if not numbers or len(set(numbers)) != len(numbers):
-        raise ArgumentError("seeds must hold at least one seed, and none twice")
+    if len(set(numbers)) != len(numbers):
+        raise ArgumentError("seeds must hold no seed twice")
     records = [record.key for scene in scenes for record in scene.manifest.frames]
     choice = FromGrid(weathers_by_name(weathers), numbers, _chosen_frames(records, keys))
     count = choice.count(len(records))

@@ -144,10 +144,10 @@ def _label(out: Path, entry: dict[str, Any], image: UInt8) -> UInt8:
 
 
 def _caption(entry: dict[str, Any]) -> str:
-    recipe = entry["recipe"]
-    severity = recipe["severity"]
-    kind = recipe["kind"] if severity is None else f"{recipe['kind']} {severity:.2f}"
-    return f"{kind}, item {entry['item']}"
+    kind, severity = entry["recipe"]["kind"], entry["recipe"]["severity"]
+    # A clear day is drawn with a severity, too.
+    how = "" if severity is None or kind == "clear" else f" {severity:.2f}"
+    return f"{kind}{how}, item {entry['item']}"
 
 
 def _stacked(blocks: list[UInt8]) -> UInt8:

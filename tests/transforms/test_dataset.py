@@ -22,6 +22,7 @@ from weather_aug.render.options import RenderOptions
 from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.transforms.dataset import WeatherDataset
+from weather_aug.transforms.sampling import Choice
 from weather_aug.weather import Weather
 
 POLICY = WeatherPolicy({"rain": 1, "snow": 1, "fog": 1}, severity=(0.5, 1.0), falling=1.0)
@@ -196,10 +197,10 @@ def test_crops_lie_anywhere_and_cover_the_picture(tiny_scene: WeatherScene) -> N
     dataset = WeatherDataset([tiny_scene], POLICY, crop=(46, 60))
     corners = set()
     for epoch in range(60):
-        dataset.set_epoch(epoch)
         for index in range(8):
             key = tiny_scene.keys[index]
-            window = dataset._window(tiny_scene, key, index)
+            opened = dataset._locate(index)[0].open(key)
+            window = dataset._window(opened, Choice(index), epoch, index)
             assert window is not None
             corners.add(window[:2])
     assert corners == {(top, left) for top in range(3) for left in range(5)}

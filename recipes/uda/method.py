@@ -30,7 +30,7 @@ class Method:
 
     iterations: int = 200
     batch: int = 2  # Source pictures of a step, and as many target pictures.
-    crop_px: int = 256  # Side of a crop, a multiple of 32; a detail has half of it.
+    crop_px: int = 256  # Side of a crop, a multiple of 32, at least 64; a detail has half of it.
     rate: float = 1e-3  # Of AdamW. The trainers' 6e-5 is for weights that have seen ImageNet.
     widths: tuple[int, ...] = (16, 32, 80, 128)
     head: int = 64

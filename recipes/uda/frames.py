@@ -40,7 +40,7 @@ def streets(folder: Path, count: int, width: int, height: int) -> list[Clips]:
         path = folder / f"street-{seed}-{width}x{height}"
         if not path.exists():
             address = f"street:?frames=1&width={width}&height={height}&seed={seed}"
-            wa.WeatherScene.build(wa.open_clip(address), path)
+            wa.WeatherScene.build(wa.open_clip(address), path, progress=True)
         scenes.append(wa.WeatherScene.load(path))
     return [scenes[:count], scenes[count : 2 * count], scenes[2 * count :]]
 

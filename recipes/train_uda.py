@@ -35,7 +35,7 @@ QUICK, RESAMPLES = Method(iterations=4, crop_px=64, widths=(8, 8, 16, 16), head=
 OURS = """rain, snow and fog of severity 0.25 to 1, rendered here, as are
 all targets and what the arm weather_aug learns with labels: its advantage. See --validation"""
 NOTE = """A gain of weather_aug counts against photometric and mixed-2d, not against none.
-[95 % of resamples of frames and seeds; of frames alone if there is one seed]. Weathered frames: {}."""
+[95 % of resamples of frames and, if there are several, of seeds]. Weathered frames: {}."""
 
 
 @dataclass(frozen=True)

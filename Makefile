@@ -32,6 +32,7 @@ lint: setup
 
 bench: setup
 	$(THREADS) NUMBA_NUM_THREADS=1 NO_ALBUMENTATIONS_UPDATE=1 $(BIN)/python -m benchmarks.run
+	NO_ALBUMENTATIONS_UPDATE=1 $(BIN)/python -m benchmarks.readme_table
 
 figures: setup
 	$(BIN)/python recipes/02_physics_figures.py --out docs/figures

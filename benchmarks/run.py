@@ -1,4 +1,7 @@
-"""Print all ratios: `make bench`. One process, one core, processor time, interleaved medians."""
+"""Print all ratios: `make bench`. Interleaved medians of processor time in one process on one core.
+
+The DataLoader's are of the time on the wall, with two workers of one thread each.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +22,7 @@ from benchmarks import (
     gaussians,
     gaussians_plot,
     growth,
+    loader,
     overlays,
     plot,
     sample,
@@ -40,6 +44,7 @@ def main() -> None:
         "crowds": crowds.measure(),
         "fidelity": fidelity.measure(),
         "sample": sample.measure(),
+        "loader": loader.measure(),
         "stages": stages.measure(),
         "growth": growth.measure(),
         "gaussians": gaussians.measure(),

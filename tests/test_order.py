@@ -24,7 +24,7 @@ STAGES = (
     "writers",
 )
 LEAVES = ("weather", "severity", "air", "timeline", "taxonomy", "colour", "errors")
-FREE = ("cli", "doctor")
+FREE = ("cli", "doctor", "preview")
 """They stand outside the flow and may know everybody."""
 
 

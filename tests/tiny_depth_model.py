@@ -119,6 +119,9 @@ def _saved(folder: Path, kind: Any, config: Any, processor: Any, seed: int) -> P
                 if weight.ndim > 1:
                     # As drawn they are so small that every picture has the same depth.
                     torch.nn.init.kaiming_normal_(weight)
+                if weight.ndim == 4 and weight.shape[0] == 1:
+                    # Before the last rectifier, which a random sign may leave at 0 everywhere.
+                    weight.abs_()
         network.save_pretrained(folder)
     processor.save_pretrained(folder)
     return folder

@@ -26,6 +26,10 @@ _HOMES = {
     "WeatherPolicy": "weather_aug.scene.policy",
     "WeatherTimeline": "weather_aug.timeline",
     "WeatherDataset": "weather_aug.transforms.dataset",
+    "RareClass": "weather_aug.transforms.sampling",
+    "SeverityCurriculum": "weather_aug.transforms.curriculum",
+    "Uniform": "weather_aug.transforms.sampling",
+    "WeatherSampler": "weather_aug.transforms.sampler",
     "WeatherAugError": "weather_aug.errors",
 }
 
@@ -46,7 +50,11 @@ if TYPE_CHECKING:
     from weather_aug.scene.viewpoint import Viewpoint as Viewpoint
     from weather_aug.scene.viewpoint import ViewpointJitter as ViewpointJitter
     from weather_aug.timeline import WeatherTimeline as WeatherTimeline
+    from weather_aug.transforms.curriculum import SeverityCurriculum as SeverityCurriculum
     from weather_aug.transforms.dataset import WeatherDataset as WeatherDataset
+    from weather_aug.transforms.sampler import WeatherSampler as WeatherSampler
+    from weather_aug.transforms.sampling import RareClass as RareClass
+    from weather_aug.transforms.sampling import Uniform as Uniform
     from weather_aug.weather import Weather as Weather
 
 

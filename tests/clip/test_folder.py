@@ -282,3 +282,13 @@ def test_a_teacher_is_checked(tmp_path: Path, answer: object, expected: str) -> 
     clip = LabelledClip(FolderClip(tmp_path, images="images"), lambda image: answer)
     with pytest.raises(ArgumentError, match=expected):
         clip.frame(clip.keys[0])
+
+
+@needs_camvid
+def test_a_label_is_read_without_its_picture() -> None:
+    clip = open_clip(f"folder:{DATA}?images=val&labels=valannot&taxonomy=camvid11&scale=0.5")
+    key = clip.keys[3]
+    label = clip.label(key)
+    assert (label == clip.frame(key).label).all()
+    assert not label.flags.writeable
+    assert open_clip(f"folder:{DATA}?images=val").label(key) is None

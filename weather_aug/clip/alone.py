@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug._checks import finite, image_uint8
+from weather_aug._compiled import compiled
 from weather_aug.clip.completion import completed
 from weather_aug.clip.drivable import edge_behind, ground_edge
 from weather_aug.clip.horizon import pitch_from_picture, shrunk
@@ -28,6 +29,7 @@ ABOVE_HORIZON_SHARE = 0.2
 GROUND_CONFIDENCE, FOOT_CONFIDENCE, FACADE_CONFIDENCE = 100.0, 1.0, 3e-3
 FOOT_ROWS = 3
 SWEEPS = 8
+COLOUR_REACH_PX = 9
 CAR = TRAIN_ID["car"]
 
 
@@ -79,12 +81,12 @@ def depth_from_picture(
     sky = parted.label == SKY
     # In inverse depth the ground is linear, and a membrane over it stays flat.
     inverse = completed(
-        1 / prior, _confidence(parted.label), parted.image, barrier=sky, sweeps=SWEEPS
+        np.reciprocal(prior), _confidence(parted.label), parted.image, barrier=sky, sweeps=SWEEPS
     )
     height, width = image.shape[:2]
     grown = cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR)
     depth = 1 / np.clip(grown, 1 / MAX_DEPTH_M, 1 / MIN_DEPTH_M)
-    depth[_grown(sky, image.shape) > 0.5] = np.inf
+    depth[_sky_at_full_size(image, parted.image, sky)] = np.inf
     return np.asarray(depth, np.float32)
 
 
@@ -142,10 +144,45 @@ def _parted(image: UInt8, focal_px: float, principal_px: tuple[float, float]) ->
     return _Parted(small, label, scale, (x, y), pitch_rad)
 
 
-def _grown(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> Float32:
-    """A mask of the small picture as shares of the whole one's pixels, (H, W)."""
-    share = mask.astype(np.float32)
-    return np.asarray(cv2.resize(share, shape[1::-1], interpolation=cv2.INTER_LINEAR))
+def _sky_at_full_size(image: UInt8, small: UInt8, sky: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The small picture's sky (h, w) at full size (H, W), its border where the colours part."""
+    size = image.shape[1::-1]
+    share = cv2.blur(sky.astype(np.float32), (3, 3))
+    share = cv2.resize(share, size, interpolation=cv2.INTER_LINEAR)
+    if image.shape == small.shape or not sky.any():
+        return np.asarray(share > 0.5)
+    sides = [_mean_colour(small, mask.astype(np.float32)) for mask in (sky, ~sky)]
+    border: NDArray[np.bool_] = _parted_by_colour(image, share, *sides)
+    return border
+
+
+def _mean_colour(image: UInt8, weight: Float32) -> Float32:
+    """Of the weighted pixels around each, (h, w, 3)."""
+    reach = (COLOUR_REACH_PX, COLOUR_REACH_PX)
+    total = cv2.blur(image * weight[..., None], reach)
+    return np.asarray(total / np.maximum(cv2.blur(weight, reach), 1e-6)[..., None], np.float32)
+
+
+@compiled
+def _parted_by_colour(
+    image: UInt8, share: Float32, sky: Float32, land: Float32
+) -> NDArray[np.bool_]:
+    """Near the border (0 < share < 1) the side whose colour nearby is closer, (H, W)."""
+    height, width = share.shape
+    rows, columns = sky.shape[:2]
+    found = share > np.float32(0.5)
+    for row in range(height):
+        i = row * rows // height
+        for column in range(width):
+            if np.float32(0.02) < share[row, column] < np.float32(0.98):
+                j = column * columns // width
+                to_sky = to_land = np.float32(0.0)
+                for channel in range(3):
+                    value = np.float32(image[row, column, channel])
+                    to_sky += (value - sky[i, j, channel]) ** 2
+                    to_land += (value - land[i, j, channel]) ** 2
+                found[row, column] = to_sky < to_land
+    return found
 
 
 def _open_sky(image: UInt8, horizon_px: float) -> NDArray[np.bool_]:

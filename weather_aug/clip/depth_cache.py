@@ -10,6 +10,7 @@ Convention:
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 import secrets
 from dataclasses import dataclass
@@ -93,8 +94,6 @@ class DepthCache:
 
 
 def _header(array: NDArray[np.generic]) -> bytes:
-    import io
-
     buffer = io.BytesIO()
     np.lib.format.write_array_header_1_0(buffer, np.lib.format.header_data_from_array_1_0(array))
     return buffer.getvalue()
@@ -106,7 +105,8 @@ def _read(file: BinaryIO, shape: tuple[int, ...]) -> Float32:
         raise ValueError("not a .npy file of version 1.0")
     found, in_columns, dtype = np.lib.format.read_array_header_1_0(file)
     if found != shape or in_columns or dtype not in _ACCEPTED:
-        raise ValueError(f"it holds {dtype} {found}, a float16 array of {shape} is needed")
+        order = "column by column" if in_columns else "row by row"
+        raise ValueError(f"it holds {dtype} {found} {order}, not float16 {shape} row by row")
     size = int(np.prod(shape)) * dtype.itemsize
     values = file.read(size + 1)
     if len(values) != size:

@@ -6,6 +6,9 @@ Convention:
     label, or without one the picture, shows as ground. Where too little ground is seen, or
     the line would turn near into far, median and quartiles of inverse depth are made those of the
     geometric prior. Sky is at `inf`. Nothing is downloaded, and nothing is unpickled.
+
+Source: scale and shift of inverse depth are those of Ranftl et al. 2022, "Towards Robust Monocular
+Depth Estimation"; the line of median slope is that of Theil 1950 and Sen 1968.
 """
 
 from __future__ import annotations
@@ -39,6 +42,7 @@ UInt8 = NDArray[np.uint8]
 KINDS = ("auto", "metric", "relative")
 LEAST_SIDE_PX, MOST_ASPECT = 8, 16
 LEAST_GROUND_PIXELS = 100
+GROUPS = 48
 ROUNDS = 10
 TUKEY = 4.685
 SKY_BEYOND_M, SKY_SHARE = 30.0, 0.5
@@ -166,20 +170,40 @@ def _thinned(*values: NDArray[Any]) -> tuple[Float64, ...]:
     return tuple(value[::step].astype(np.float64) for value in values)
 
 
-def _robust_line(x: Float64, y: Float64) -> tuple[float, float] | None:
-    """Slope and intercept of y over x, Tukey's biweight; None unless the slope is above 0."""
-    weight = np.ones_like(x)
+def _robust_line(relative: Float64, inverse: Float64) -> tuple[float, float] | None:
+    """Scale and shift from relative to inverse depth; None unless near stays near.
+
+    Relative depth is what errs, so it is fitted over inverse depth: a Theil-Sen line through the
+    medians of groups, since an own bonnet lies where leverage is greatest; then Tukey's biweight.
+    """
+    slope, level = _median_line(relative, inverse)
     for _ in range(ROUNDS):
+        off = np.abs(relative - level - slope * inverse)
+        weight = np.maximum(0.0, 1 - (off / (TUKEY * 1.4826 * np.median(off) + 1e-30)) ** 2) ** 2
         total = weight.sum()
-        mean_x, mean_y = (weight @ x) / total, (weight @ y) / total
-        spread = weight @ (x - mean_x) ** 2
-        if not spread > 1e-9 * (weight @ x**2):
+        x, y = (weight @ inverse) / total, (weight @ relative) / total
+        spread = weight @ (inverse - x) ** 2
+        if not spread > 1e-9 * total * x**2:
             return None
-        slope = (weight @ ((x - mean_x) * (y - mean_y))) / spread
-        off = np.abs(y - mean_y - slope * (x - mean_x))
-        scale = TUKEY * 1.4826 * max(float(np.median(off)), 1e-9)
-        weight = np.maximum(0.0, 1 - (off / scale) ** 2) ** 2
-    return (float(slope), float(mean_y - slope * mean_x)) if slope > 0 else None
+        slope = (weight @ ((inverse - x) * (relative - y))) / spread
+        level = y - slope * x
+    # Of what does not change with depth nothing can be said.
+    if not slope * np.ptp(inverse) > 1e-6 * np.abs(relative).max():
+        return None
+    return float(1 / slope), float(-level / slope)
+
+
+def _median_line(relative: Float64, inverse: Float64) -> tuple[float, float]:
+    order = np.argsort(inverse, kind="stable")
+    groups = np.array_split(order, min(GROUPS, len(order)))
+    x = np.array([np.median(inverse[group]) for group in groups])
+    y = np.array([np.median(relative[group]) for group in groups])
+    first, second = np.triu_indices(len(groups), 1)
+    apart = x[second] > x[first]
+    if not apart.any():
+        return 0.0, float(np.median(y))
+    slope = float(np.median(((y[second] - y[first])[apart]) / (x[second] - x[first])[apart]))
+    return slope, float(np.median(y - slope * x))
 
 
 def _same_spread(x: NDArray[Any], y: Float64) -> tuple[float, float]:

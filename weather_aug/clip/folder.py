@@ -120,7 +120,7 @@ class FolderClip:
             taxonomy = _taxonomy_of(top / labels)
         self._taxonomy = None if taxonomy is None else taxonomy_called(taxonomy)
         self._scale = checked_scale(scale)
-        self._height_m = finite("height_m", height_m, 0.1, 100.0)
+        self.camera_height_m = self._height_m = finite("height_m", height_m, 0.1, 100.0)
         self._hfov_rad = math.radians(finite("hfov_deg", hfov_deg, 5.0, 150.0))
         self._focal_px = None if focal_px is None else finite("focal_px", focal_px, 10.0, 1e5)
         self._pitch_rad = math.radians(finite("pitch_deg", pitch_deg, -30.0, 30.0))
@@ -165,6 +165,14 @@ class FolderClip:
             depth_m = read_only(depth_m)
         return Frame(key, index / self._fps, camera, read_only(image), label, depth_m)
 
+    def label(self, key: FrameKey) -> NDArray[np.uint8] | None:
+        """(H, W) train ids of one picture, which is not read for it; None where nobody labelled."""
+        index = check_key(self, key).time_index
+        if self._labels is None:
+            return None
+        ids = self._train_ids(self._labels[index], read_label(self._labels[index]))
+        return read_only(resized_label(ids, *scaled_size(ids.shape[1], ids.shape[0], self._scale)))
+
     def _camera(self, index: int, width: int, height: int) -> Camera:
         focal_px = self._focal_px or 0.5 * width / math.tan(0.5 * self._hfov_rad)
         intrinsics = [[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]]
@@ -185,6 +193,9 @@ class FolderClip:
     def _label(self, path: Path, index: int, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         ids = read_label(path)
         _like_picture(path, ids.shape, self._images[index], image)
+        return self._train_ids(path, ids)
+
+    def _train_ids(self, path: Path, ids: NDArray[np.integer]) -> NDArray[np.uint8]:
         assert self._taxonomy is not None, "labels have a taxonomy"
         return self._taxonomy.train_ids(ids, where=shown(path))
 

@@ -24,7 +24,7 @@ from weather_aug.errors import (
     WeatherAugError,
     printable,
 )
-from weather_aug.writers.layout import CONTENTS, STATE, Layout
+from weather_aug.writers.layout import CONTENTS, JOURNAL, STATE, Layout
 
 STATES = Path(".weather-aug-export")
 """Where the states of exports to urls stand if nobody chooses, in the working directory."""
@@ -112,16 +112,18 @@ class FsspecFolder:
                     self._fs.rm_file(path)
 
     def found_job(self) -> Any:
-        """The job that the place is of, finished or not; None if it is empty.
+        """The job that the place is of, finished or not; None if nothing there tells.
 
         Raises:
-            ConflictError: If it holds something else.
+            ConflictError: If it holds something else, of which the state does not know either.
             OutputError: If it cannot be read.
         """
         for name in (_MARK, CONTENTS):
             found = self._json(name)
             if isinstance(found, dict) and isinstance(found.get("job"), dict):
                 return found["job"]
+        if any((self.state / name).exists() for name in (JOURNAL, CONTENTS)):
+            return None
         with self._reported("", "read"):
             foreign = sorted(path.rstrip("/").rpartition("/")[2] for path in self._entries())
         if foreign and foreign != [STATE]:

@@ -32,6 +32,8 @@ from weather_aug.writers.ray_engine import run_ray
 from weather_aug.writers.target import LocalFolder
 
 HERE = Path(__file__).parent
+PATHS = os.pathsep.join([str(HERE), str(HERE.parents[1])])
+"""Where actors find their faults, and this package."""
 
 
 @pytest.fixture(scope="session")
@@ -43,6 +45,7 @@ def ray() -> Any:
 def standing(ray: Any) -> Iterator[Any]:
     """A Ray that the user started, for tests that need no start of their own."""
     environment = dict(os.environ)
+    os.environ["PYTHONPATH"] = PATHS
     ray.init("local", num_cpus=2, include_dashboard=False, configure_logging=False)
     yield ray
     ray.shutdown()
@@ -99,9 +102,7 @@ def test_the_exporter_may_be_killed(
     ray: Any, plan: ExportPlan, out: Path, expected_tree: dict[str, str], tmp_path: Path
 ) -> None:
     script = f"""
-import sys
 from pathlib import Path
-sys.path.insert(0, {str(HERE)!r})
 import ray_faults
 from tiny_export import POLICY
 from weather_aug.scene.scene import WeatherScene
@@ -112,7 +113,12 @@ ray_engine.Renderer = ray_faults.Slow
 scene = WeatherScene.load({str(plan.scenes[0].path)!r})
 export(plan_export([scene], POLICY, count=10, seed=3), Path({str(out)!r}), engine="ray", workers=2)
 """
-    exporter = subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.DEVNULL)
+    exporter = subprocess.Popen(
+        [sys.executable, "-c", script],
+        env=os.environ | {"PYTHONPATH": PATHS},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
     deadline = time.monotonic() + 120
     while not (out / ".export/journal").exists() or len(committed(out)) < 3:
         assert exporter.poll() is None and time.monotonic() < deadline

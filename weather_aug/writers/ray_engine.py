@@ -252,8 +252,8 @@ class _Cast:
             self._failed_starts += 1
             if self._failed_starts >= MAX_FAILED_STARTS:
                 raise WeatherAugError(
-                    f"Ray actors end while they start: {printable(error, 400)}; every node needs "
-                    "this weather-aug and the packages that it needs"
+                    f"Ray actors end while they start: {_last_line(error)}; every node needs this "
+                    "weather-aug and the packages that it needs"
                 )
         elif unit is not None and not self.losses.may_try_again(unit):
             unit = None
@@ -270,6 +270,11 @@ class _Cast:
                 f"{total.get('CPU', 0):g} CPUs, {free.get('CPU', 0):g} of them free; end other "
                 "jobs, or give a smaller cpus_per_actor"
             )
+
+
+def _last_line(error: Exception) -> str:
+    """What Ray's long and coloured messages come to."""
+    return printable((str(error).strip().splitlines() or [type(error).__name__])[-1], 300)
 
 
 @contextmanager

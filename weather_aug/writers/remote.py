@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 from weather_aug import _files
 from weather_aug._extras import require
@@ -273,9 +272,9 @@ class FsspecFolder:
 
     def __str__(self) -> str:
         """The url without user and password."""
-        parts = urlsplit(self.url)
-        netloc = parts.netloc.rpartition("@")[2]
-        return printable(parts._replace(netloc=netloc, query="").geturl().rstrip("/"), 200)
+        protocol, _, rest = self.url.partition("?")[0].partition("://")
+        host, slash, path = rest.partition("/")
+        return printable(f"{protocol}://{host.rpartition('@')[2]}{slash}{path.rstrip('/')}", 200)
 
     __repr__ = __str__
 

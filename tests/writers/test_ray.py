@@ -6,6 +6,7 @@ import faulthandler
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -231,12 +232,52 @@ def test_actors_write_to_a_url(
     assert tree_of(out) == expected_tree
 
 
+@pytest.fixture
+def cluster(ray: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """Address of a Ray that was started outside this process."""
+    ray.shutdown()
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    command = [str(Path(sys.executable).parent / "ray"), "start", "--head", "--block"]
+    options = ["--num-cpus=2", "--include-dashboard=false", "--disable-usage-stats"]
+    head = subprocess.Popen(
+        [*command, *options, "--node-ip-address=127.0.0.1", f"--port={address.split(':')[1]}"],
+        env=os.environ | {"PYTHONPATH": PATHS},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    yield address
+    head.terminate()
+    head.wait(30)
+
+
+@pytest.mark.slow
+def test_a_cluster_renders_the_same_tree_and_stays(
+    ray: Any, cluster: str, plan: ExportPlan, out: Path, expected_tree: dict[str, str]
+) -> None:
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        try:
+            report = export(plan, out, engine="ray", workers=2, address=cluster)
+            break
+        except WeatherAugError:
+            time.sleep(1)
+    assert report.rendered == 10
+    assert tree_of(out) == expected_tree
+    assert not ray.is_initialized()
+    export(plan, out.with_name("again"), engine="ray", workers=1, address=cluster)
+    assert tree_of(out.with_name("again")) == expected_tree
+
+
 @pytest.mark.slow
 def test_an_address_without_a_ray_is_named(ray: Any, plan: ExportPlan, out: Path) -> None:
-    if ray.is_initialized():
-        ray.shutdown()
-    with pytest.raises(WeatherAugError, match=r"no Ray could be reached at nowhere:1"):
-        export(plan, out, engine="ray", address="nowhere:1")
+    ray.shutdown()
+    start_s = time.monotonic()
+    with pytest.raises(WeatherAugError, match=r"no Ray could be reached at 127\.0\.0\.1:1:"):
+        export(plan, out, engine="ray", address="127.0.0.1:1")
+    assert time.monotonic() - start_s < 20
 
 
 @pytest.mark.parametrize("bad", [{"actors": 0}, {"cpus_per_actor": 0.0}])

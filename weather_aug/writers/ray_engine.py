@@ -14,6 +14,7 @@ import faulthandler
 import json
 import os
 import signal
+import socket
 import sys
 import threading
 import time
@@ -53,6 +54,7 @@ from weather_aug.writers.worker import DONE, FAILED, READY, sendable
 
 START_WAIT_S = 600.0
 """How long no actor at all may start: clusters that grow on demand take minutes."""
+CONNECT_WAIT_S = 10.0
 
 _OBJECT_STORE_BYTES = 100 * 2**20
 _TOKEN = f"{STATE}/ray"
@@ -212,14 +214,17 @@ class _Cast:
         if not heard:
             self._check_somebody_started()
         for answer in heard:
-            seat = self.waiting.pop(answer)
+            # Who is still waited for when an error leaves this loop is ended by `stop`.
+            seat = self.waiting[answer]
             try:
                 kind, value = self._ray.get(answer)
             except self._ray.exceptions.RayError as error:
+                del self.waiting[answer]
                 self._bury(seat, error)
                 continue
             if kind == FAILED:
                 raise with_note(*value)
+            del self.waiting[answer]
             done = seat.unit
             if kind == READY:
                 seat.ready, self._failed_starts = True, 0
@@ -303,19 +308,27 @@ def _connect(ray: ModuleType, address: str | None, local_cpus: int) -> None:
     }
     handler = signal.getsignal(signal.SIGTERM)
     try:
+        _check_reachable(address)
         ray.init(
             "local" if address is None else address,
             **(own if address is None else {}),
             log_to_driver=False,
             configure_logging=False,
         )
-    except (ConnectionError, RuntimeError, ValueError) as error:
+    except (OSError, RuntimeError, ValueError) as error:
         place = "on this machine" if address is None else f"at {printable(address, 200)}"
         raise WeatherAugError(f"no Ray could be reached {place}: {error}") from error
     finally:
         # Ray's handler would end this process without a word about the export.
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, handler)
+
+
+def _check_reachable(address: str | None) -> None:
+    """Knock at host:port first, because `ray.init` waits for ever where nobody answers."""
+    host, _, port = (address or "").rpartition("://")[2].rpartition(":")
+    if host and port.isdigit():
+        socket.create_connection((host.strip("[]"), int(port)), CONNECT_WAIT_S).close()
 
 
 def _undo_environment(before: dict[str, str], during: dict[str, str]) -> None:

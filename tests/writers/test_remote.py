@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import pickle
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +16,6 @@ from tiny_export import POLICY, tree_of
 
 from weather_aug import _files
 from weather_aug.errors import ArgumentError, ConflictError, MissingExtraError, OutputError
-from weather_aug.writers import export as exporter
 from weather_aug.writers.export import export
 from weather_aug.writers.plan import ExportPlan, plan_export
 from weather_aug.writers.remote import FsspecFolder, default_state
@@ -197,7 +195,7 @@ def test_an_outage_is_no_damage(
     with pytest.raises(Stop):
         export(plan, FLAKY, state=state, on_sample=stop_after(4))
     FlakyStore.unreadable = True
-    with pytest.raises(OutputError, match="cannot read flaky://.*no route to host"):
+    with pytest.raises(OutputError, match=r"cannot read flaky://.*no route to host"):
         export(plan, FLAKY, state=state)
     FlakyStore.unreadable = False
     report = export(plan, FLAKY, state=state)
@@ -280,7 +278,7 @@ def test_the_state_stands_in_the_working_directory_by_itself(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     export(plan, URL)
-    assert os.listdir(tmp_path) == [".weather-aug-export"]
+    assert [tmp_path / ".weather-aug-export"] == list(tmp_path.iterdir())
     assert json.loads((default_state(URL) / "export.json").read_text())["job"] == plan.job
     assert default_state(URL) == default_state(URL + "/") != default_state(FLAKY)
-    assert exporter.export(plan, URL).rendered == 0
+    assert export(plan, URL).rendered == 0

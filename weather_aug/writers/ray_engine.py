@@ -21,7 +21,7 @@ import time
 import traceback
 import uuid
 from collections.abc import Callable, Generator, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
@@ -238,20 +238,25 @@ class _Cast:
     def stop(self) -> None:
         """End the actors that are left, whatever they do."""
         for seat in self.waiting.values():
-            self._ray.kill(seat.actor)
+            self._end(seat)
         self.waiting.clear()
+
+    def _end(self, seat: _Seat) -> None:
+        # One that never came to be cannot be killed, which must not hide why.
+        with suppress(self._ray.exceptions.RayError):
+            self._ray.kill(seat.actor)
 
     def _assign(self, seat: _Seat) -> None:
         """Hand an actor its unit; one without any goes home."""
         if seat.unit is None:
-            self._ray.kill(seat.actor)
+            self._end(seat)
         else:
             self.waiting[seat.actor.write.remote(seat.unit)] = seat
 
     def _bury(self, seat: _Seat, error: Exception) -> None:
         """Replace an actor that died, and count its death against the unit that it had."""
         # One that is only out of reach must not write beside its successor.
-        self._ray.kill(seat.actor)
+        self._end(seat)
         unit = seat.unit
         if not seat.ready:
             self._failed_starts += 1

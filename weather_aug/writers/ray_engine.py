@@ -37,6 +37,7 @@ from weather_aug.errors import (
     WeatherAugError,
     printable,
 )
+from weather_aug.render.compose import warm_up
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.writers.engines import (
     LISTEN_S,
@@ -97,6 +98,8 @@ def run_ray(
         raise ArgumentError(f"actors must be at least 1, got {actors}")
     if not 0 < cpus_per_actor < float("inf"):
         raise ArgumentError(f"cpus_per_actor must be above 0, got {cpus_per_actor}")
+    # Compiled once, not by each actor on this machine at the same time.
+    warm_up()
     scenes = tuple(WeatherScene(scene.path.absolute()) for scene in plan.scenes)
     # Ray that has exactly the cores of its actors would leave none for anything else.
     local_cpus = max(os.cpu_count() or 1, int(actors * cpus_per_actor) + 1)

@@ -92,7 +92,9 @@ class FsspecFolder:
                 return False
 
     def make_folders(self, relatives: Iterable[str]) -> None:
-        """Each with its parents; a store of objects has none."""
+        """Each with its parents, where there are folders."""
+        if self._puts_whole:
+            return
         for relative in relatives:
             with self._reported(relative):
                 self._fs.makedirs(self._path(relative), exist_ok=True)

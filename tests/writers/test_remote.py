@@ -89,7 +89,7 @@ def test_the_state_continues_what_was_stopped(
     with pytest.raises(Stop):
         export(plan, URL, state=state, on_sample=stop_after(4))
     assert "export.json" not in remote_tree(URL)
-    assert export(plan, URL, state=state).rendered == 6
+    assert export(plan, URL, state=str(state)).rendered == 6
     assert remote_tree(URL) == expected_tree
 
 

@@ -60,7 +60,7 @@ def export(
     workers: int = 1,
     engine: str = "process",
     address: str | None = None,
-    state: Path | None = None,
+    state: str | Path | None = None,
     storage_options: Mapping[str, Any] | None = None,
     progress: bool = False,
     verify: bool = False,
@@ -239,12 +239,12 @@ def _engine(name: str, workers: int, address: str | None) -> Engine:
 
 
 def _target(
-    plan: ExportPlan, out: str | Path, state: Path | None, options: Mapping[str, Any] | None
+    plan: ExportPlan, out: str | Path, state: str | Path | None, options: Mapping[str, Any] | None
 ) -> Target:
     """The place `out`; its local folder is made."""
     scenes = [scene.path for scene in plan.scenes]
     if isinstance(out, str) and "://" in out:
-        place = FsspecFolder(out, state or default_state(out), options or {})
+        place = FsspecFolder(out, Path(state or default_state(out)), options or {})
         return replace(place, state=check_output(place.state, scenes))
     if state is not None or options is not None:
         raise ArgumentError(

@@ -2,7 +2,8 @@
 
 An engine gives (unit, manifest lines) in the order of completion; it writes samples, never the
 journal. Workers are started afresh (spawn), take one unit at a time, and are told apart by their
-pipes, so that one that dies is noticed at once and costs at most the unit it had.
+pipes, so that one that dies is noticed at once and costs at most the unit it had. Workers on other
+machines are those of `ray_engine`.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 from collections import Counter
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from multiprocessing import connection
 from typing import Any
@@ -34,6 +35,8 @@ STOP_WAIT_S = 5.0
 
 Finished = tuple[int, list[str]]
 """A unit, and its items' lines of the manifest."""
+Engine = Callable[[ExportPlan, Target, Iterator[int]], Generator[Finished, None, None]]
+"""Renders units of a plan to a target."""
 
 
 def run_inline(
@@ -62,7 +65,48 @@ def run_processes(
             yield from crew.finished()
     finally:
         crew.stop()
-    crew.raise_if_lost()
+    crew.losses.raise_if_any()
+
+
+class Losses:
+    """The units that killed their workers, and those given up for it."""
+
+    def __init__(self, plan: ExportPlan, target: Target) -> None:
+        self._plan, self._target = plan, target
+        self._deaths: Counter[int] = Counter()
+        self._lost: list[int] = []
+
+    def may_try_again(self, unit: int) -> bool:
+        """Count a worker's death against the unit it had; whether a fresh one may get it.
+
+        Raises:
+            IntegrityError: If so many are lost that it is the machine that is at fault.
+        """
+        self._deaths[unit] += 1
+        if self._deaths[unit] <= MAX_RETRIES:
+            return True
+        self._lost.append(unit)
+        if len(self._lost) >= MAX_QUARANTINED:
+            self.raise_if_any()
+        return False
+
+    def raise_if_any(self) -> None:
+        """Name the items of units that no worker survived, if there are any.
+
+        Raises:
+            IntegrityError: If there are.
+        """
+        if not self._lost:
+            return
+        items = [index for unit in self._lost for index in self._plan.items_of(unit)]
+        lines = [json.dumps({"item": k, "recipe": self._plan.recipe(k)}) for k in items]
+        path = self._target.state / layout.QUARANTINE
+        _files.write_whole(path, ("\n".join(lines) + "\n").encode())
+        raise IntegrityError(
+            f"{len(lines)} item(s) killed {MAX_RETRIES + 1} workers each and are missing: "
+            f"{', '.join(str(index) for index in items)} (recipes in {path}); the first is "
+            f"{lines[0]}; free memory or use fewer workers, then run it again to continue"
+        )
 
 
 @dataclass(eq=False)
@@ -83,8 +127,7 @@ class _Crew:
         self.members: list[_Member] = []
         self._plan, self._target, self._units = plan, target, units
         self._context = multiprocessing.get_context("spawn")
-        self._deaths: Counter[int] = Counter()
-        self._lost: list[int] = []
+        self.losses = Losses(plan, target)
         self._failed_starts = 0
 
     def start(self, unit: int | None) -> None:
@@ -116,7 +159,7 @@ class _Crew:
                 self._bury(member)
                 continue
             if kind == FAILED:
-                raise _with_note(*value)
+                raise with_note(*value)
             done = member.unit
             if kind == READY:
                 member.ready, self._failed_starts = True, 0
@@ -135,20 +178,6 @@ class _Crew:
         for member in self.members:
             member.process.join(STOP_WAIT_S)
         self.members.clear()
-
-    def raise_if_lost(self) -> None:
-        """Name the items of units that no worker survived, if there are any."""
-        if not self._lost:
-            return
-        items = [index for unit in self._lost for index in self._plan.items_of(unit)]
-        lines = [json.dumps({"item": k, "recipe": self._plan.recipe(k)}) for k in items]
-        path = self._target.state / layout.QUARANTINE
-        _files.write_whole(path, ("\n".join(lines) + "\n").encode())
-        raise IntegrityError(
-            f"{len(lines)} item(s) killed {MAX_RETRIES + 1} workers each and are missing: "
-            f"{', '.join(str(index) for index in items)} (recipes in {path}); the first is "
-            f"{lines[0]}; free memory or use fewer workers, then run it again to continue"
-        )
 
     def _assign(self, member: _Member) -> None:
         """Hand a worker its unit; one without any goes home."""
@@ -177,17 +206,12 @@ class _Crew:
                     "a script that exports must stand under `if __name__ == '__main__':`; with "
                     "workers=1 it runs without them"
                 )
-        elif unit is not None:
-            self._deaths[unit] += 1
-            if self._deaths[unit] > MAX_RETRIES:
-                self._lost.append(unit)
-                unit = None
-            if len(self._lost) >= MAX_QUARANTINED:
-                self.raise_if_lost()
+        elif unit is not None and not self.losses.may_try_again(unit):
+            unit = None
         self.start(unit)
 
 
-def _with_note(error: Exception, trace: str) -> Exception:
+def with_note(error: Exception, trace: str) -> Exception:
     """A worker's error; one that is not ours keeps the place where it happened."""
     if not isinstance(error, WeatherAugError):
         error.add_note(f"in an export worker:\n{trace}")

@@ -45,7 +45,7 @@ def work(plan: ExportPlan, target: Target, pipe: Connection) -> None:
         # Like being killed for it: a fresh worker may fit, and too large an item is quarantined.
         os._exit(1)
     except Exception as error:
-        pipe.send((FAILED, (_sendable(error), traceback.format_exc())))
+        pipe.send((FAILED, (sendable(error), traceback.format_exc())))
 
 
 def _leave_with_parent() -> None:
@@ -59,7 +59,7 @@ def _leave_with_parent() -> None:
         os._exit(1)
 
 
-def _sendable(error: Exception) -> Exception:
+def sendable(error: Exception) -> Exception:
     """The error itself if it survives a pipe, else one that says the same."""
     try:
         pickle.loads(pickle.dumps(error))

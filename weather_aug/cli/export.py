@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
@@ -66,7 +66,11 @@ class Export:
     split: str = "train"
     """Folder such as train or val."""
     workers: int = 1
-    """Processes; the result does not depend on it."""
+    """Processes, or actors of Ray; the result does not depend on it."""
+    engine: Literal["process", "inline", "ray"] = "process"
+    """Who renders: processes of this machine, this process alone, or Ray."""
+    address: str | None = None
+    """Of a Ray cluster, which must see --out; without one Ray starts on this machine."""
     verify: bool = False
     """Compare every byte of what is there already, not only sizes, and repair what differs."""
     dry_run: bool = False
@@ -92,6 +96,8 @@ class Export:
             plan,
             self.out,
             workers=self.workers,
+            engine=self.engine,
+            address=self.address,
             progress=to_people() and not self.quiet,
             verify=self.verify,
         )
@@ -161,6 +167,8 @@ class Export:
             rare = list(plan.choice.balance.shares().items())[:RARE_SHOWN]
             say(f"classes  frames are chosen for {_shares(dict(rare))}")
         engine = "this process" if self.workers <= 1 else f"{self.workers} processes"
+        if self.engine == "ray":
+            engine = f"{self.workers} actors of Ray"
         say(f"layout   {plan.layout.name}, {plan.split}: {', '.join(plan.parts)}; by {engine}")
         done = committed(self.out)
         if done >= plan.count:

@@ -136,7 +136,8 @@ def test_damage_is_repaired(
     fs = fsspec.filesystem("memory")
     path = f"/bucket/rainy/{plan.paths(3)['image'] if name == 'image' else name}"
     data = bytearray(fs.cat_file(path))
-    data[len(data) // 2] ^= 1
+    place = data.index(b"2000") if name == "export.json" else len(data) // 2
+    data[place] ^= 1
     fs.pipe_file(path, bytes(data))
     report = export(plan, URL, state=state, verify=True)
     assert report.damaged == report.rendered == (name == "image")

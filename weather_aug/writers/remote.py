@@ -23,7 +23,7 @@ from weather_aug.errors import (
     WeatherAugError,
     printable,
 )
-from weather_aug.writers.layout import CONTENTS, JOURNAL, STATE, Layout
+from weather_aug.writers.layout import CONTENTS, JOURNAL, STATE, Layout, sealed_contents
 
 STATES = Path(".weather-aug-export")
 """Where the states of exports to urls stand if nobody chooses, in the working directory."""
@@ -122,7 +122,9 @@ class FsspecFolder:
         for name in (_MARK, CONTENTS):
             found = self._json(name)
             if isinstance(found, dict) and isinstance(found.get("job"), dict):
-                return found["job"]
+                # One that was changed names no job; it is published anew, if the state knows it.
+                if name == _MARK or _is_sealed(found):
+                    return found["job"]
         if any((self.state / name).exists() for name in (JOURNAL, CONTENTS)):
             return None
         with self._reported("", "read"):
@@ -283,3 +285,9 @@ class FsspecFolder:
 
 def _told(error: Exception) -> str:
     return printable(f"{type(error).__name__} {error}".rstrip(), 300)
+
+
+def _is_sealed(contents: Mapping[str, Any]) -> bool:
+    """Whether the fields of an `export.json` are those that were sealed."""
+    fields = {name: value for name, value in contents.items() if name != "sha256"}
+    return bool(json.loads(sealed_contents(fields)) == contents)

@@ -108,7 +108,7 @@ def test_a_notebook_is_kept_without_outputs(path: Path) -> None:
         lambda n: code_cells(n)[1].update(execution_count=3),
         lambda n: n.cells[0].metadata.update(scrolled=True),
         lambda n: n.metadata.kernelspec.update(name="somebodys-venv"),
-        lambda n: n.metadata.update(interpreter="/home/somebody/bin/python"),
+        lambda n: n.metadata.update(interpreter="python3.11"),
     ],
 )
 def test_what_a_run_leaves_is_seen(soil: Any) -> None:

@@ -25,7 +25,7 @@ from weather_aug.clip.types import Frame, FrameKey
 from weather_aug.errors import ArgumentError
 from weather_aug.taxonomy import GROUND, ROAD, SKY, taxonomy
 
-CAMVID = Path("/work/shared/data/camvid-dev")
+CAMVID = Path(__file__).resolve().parents[2] / ".." / "shared" / "data" / "camvid-dev"
 FOCAL_PX = 400.0
 PRINCIPAL_PX = (239.5, 159.5)
 HEIGHT_M = 1.5

@@ -30,7 +30,7 @@ from weather_aug.transforms.sources import ClipSource
 
 POLICY = WeatherPolicy({"rain": 1, "snow": 1, "fog": 1}, severity=(0.3, 0.7), falling=1.0)
 CROP = (32, 40)
-CAMVID = Path("/work/shared/data/camvid-dev")
+CAMVID = Path(__file__).resolve().parents[2] / ".." / "shared" / "data" / "camvid-dev"
 CAMERA_HEIGHT_M = 1.5
 LEAST_PSNR_DB = 45.0
 NO_TRACKS = RenderOptions(without=("tracks",))

@@ -41,7 +41,7 @@ def table(results: Mapping[str, Any]) -> str:
     lines += [f"| {text} | {ratios[name]:.2f} × |" for name, text in NAMES.items()]
     versions = results["machine"]["versions"]
     cpu, peer = results["machine"]["cpu"], versions["albumentations"]
-    lines += ["", f"Relative to no weather; albumentations {peer}, {cpu}, by `make bench`."]
+    lines += ["", f"Relative to no weather; albumentations {peer}, {cpu}, by benchmarks/loader.py."]
     return "\n".join(lines)
 
 

@@ -118,7 +118,7 @@ def ratios_in(text):
     values = {name: float(value.removesuffix(" ×")) for name, value in found.items()}
     assert values["no weather"] == 1.0
     assert all(0 < value < 2 for value in values.values())
-    assert between.strip().endswith("`make bench`.")
+    assert between.strip().endswith("by benchmarks/loader.py.")
     return values
 
 

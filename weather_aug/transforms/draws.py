@@ -9,12 +9,12 @@ names its samples: it is then a function of (seed, epoch, sample) alone. Without
 from __future__ import annotations
 
 import hashlib
-import sys
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch.utils.data import get_worker_info
 
 from weather_aug._keys import check_seed, key_of
 from weather_aug.errors import ArgumentError
@@ -127,7 +127,5 @@ def picture_field(picture: NDArray[Any]) -> int:
 
 def worker_seed() -> int:
     """Seed of this DataLoader worker, 0 outside one; it differs by worker and by iterator."""
-    # Where torch has not been imported nobody runs a DataLoader.
-    torch_module = sys.modules.get("torch")
-    info = torch_module.utils.data.get_worker_info() if torch_module is not None else None
+    info = get_worker_info()
     return 0 if info is None else int(info.seed)

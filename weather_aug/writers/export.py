@@ -186,7 +186,7 @@ def _check_job(plan: ExportPlan, found: Any, out: object) -> None:
 
 
 def _text(value: Any) -> str:
-    """JSON text; unlike a comparison of mappings it sees the order of a policy's types."""
+    """JSON text, by which what was read back is compared with what is planned."""
     return json.dumps(value)
 
 

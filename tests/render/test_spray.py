@@ -176,6 +176,13 @@ def test_a_puff_is_as_dense_as_a_ray_through_it_finds(yaw_rad):
         assert records[n, OPACITY] == pytest.approx(1 - math.exp(-tau), rel=1e-4)
 
 
+@pytest.mark.parametrize("time_s", [1.7, 3.4, 3.9])
+def test_a_puff_that_is_shed_at_this_very_moment_has_a_size(time_s):
+    assert math.floor(time_s / spray.EMISSION_S) * spray.EMISSION_S > time_s
+    plume = spray._plume(vehicle(), time_s, 1.0, np.zeros(3), AXES[2], 0)
+    assert np.isfinite(plume.covariance).all()
+
+
 def test_the_wind_blows_old_puffs_aside():
     camera = make_camera()
     windy = Air((0.0, 6.0, 0.0), (0.0, 18.0, 0.0))

@@ -137,7 +137,8 @@ def _plume(
     newest = math.floor(time_s / EMISSION_S)
     count = math.ceil(LONGEST_S / EMISSION_S)
     numbers = np.arange(newest - count + 1, newest + 1)
-    age: Float64 = time_s - numbers.astype(np.float64) * EMISSION_S
+    # Rounding may put the newest puff a hair after the moment.
+    age: Float64 = np.maximum(time_s - numbers.astype(np.float64) * EMISSION_S, 0.0)
     key = key_of("vehicle-spray", seed, vehicle.key) & (2**64 - 1)
     draws = _draws(np.uint64(key), numbers[0], count)
     length, width, _ = vehicle.size_m

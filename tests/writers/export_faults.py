@@ -41,6 +41,27 @@ def die_after_writing_once(plan: Any, target: Any, pipe: Any) -> None:
     worker.work(plan, target, pipe)
 
 
+def half_write_once(mark: Any) -> None:
+    """Let this process be killed in the middle of its next file, unless `mark` stands."""
+    sync = os.fsync
+
+    def deadly(descriptor: int) -> None:
+        path = os.readlink(f"/proc/self/fd/{descriptor}")
+        if path.endswith(".tmp") and not mark.exists():
+            os.ftruncate(descriptor, 100)
+            mark.write_text(path)
+            os.kill(os.getpid(), signal.SIGKILL)
+        sync(descriptor)
+
+    os.fsync = deadly  # type: ignore[assignment]
+
+
+def die_while_writing_once(plan: Any, target: Any, pipe: Any) -> None:
+    """Be killed while a file is half written, the first time."""
+    half_write_once(target.state.parent / "died")
+    worker.work(plan, target, pipe)
+
+
 def find_the_disk_full(plan: Any, target: Any, pipe: Any) -> None:
     """Fail to write DEADLY_UNIT."""
 

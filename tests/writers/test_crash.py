@@ -7,6 +7,7 @@ import random
 import signal
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -52,7 +53,8 @@ def run_until(out: Path, plan: ExportPlan, how: Mapping[str, object], chance: ra
         time.sleep(0.001)
     time.sleep(chance.uniform(0, 0.02))
     killed = process.poll() is None
-    os.killpg(process.pid, signal.SIGKILL)
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
     assert process.wait(5) in (0, -signal.SIGKILL)
     # Not communicate(): a worker that stayed would hold the pipe of errors open.
     process.stderr.close()

@@ -157,22 +157,22 @@ def kill_at_each_call(
         call, kills = call + every, kills + 1
 
 
-def committed_entries(out: Path, *, cut: bool = False) -> list[dict[str, Any]]:
-    """Entries of the journal; the last line is left out if it may be `cut`."""
+def committed_entries(out: Path) -> list[dict[str, Any]]:
+    """Entries of the journal, without a last line that a full disk cut."""
     journal = out / ".export" / "journal"
     lines = journal.read_text().splitlines(keepends=True)[1:] if journal.exists() else []
-    if cut and lines and not lines[-1].endswith("\n"):
+    if lines and not lines[-1].endswith("\n"):
         lines.pop()
     return [json.loads(line.partition(" ")[2]) for line in lines]
 
 
-def assert_committed_verifies(out: Path, *, cut: bool = True) -> None:
+def assert_committed_verifies(out: Path) -> None:
     """What the journal or the finished manifest lists is there, whole."""
     if (out / "export.json").exists():
         # Only the state folder may be left over beside a finished export.
         assert [p for p in verify_export(out) if ".export/" not in p] == []
         return
-    for entry in committed_entries(out, cut=cut):
+    for entry in committed_entries(out):
         for file in entry["files"].values():
             assert _files.sha256_of_file(out / file["path"]) == file["sha256"]
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -83,13 +87,28 @@ def live_members(session: int) -> list[int]:
     return members
 
 
+def busy_s(seconds: float) -> float:
+    """A limit in seconds, in proportion to how many processes wait for each core."""
+    return seconds * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
 def assert_all_leave(session: int, since_s: float, *, within_s: float = 2.0) -> None:
     """Workers and the helper that multiprocessing starts end soon after their parent."""
     while left := live_members(session):
-        if time.monotonic() - since_s > within_s:
+        if time.monotonic() - since_s > busy_s(within_s):
             os.killpg(session, signal.SIGKILL)
             pytest.fail(f"workers {left} outlive their parent")
         time.sleep(0.01)
+
+
+@contextmanager
+def ray_folder() -> Iterator[Path]:
+    """A folder for RAY_TMPDIR; pytest's own are too long for the names of Ray's sockets."""
+    folder = Path(tempfile.mkdtemp(prefix="ray-"))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _main(scene: str, out: str, layout: str, count: str, engine: str, *how: str) -> None:

@@ -75,3 +75,11 @@ class Slow(Renderer):
     def write(self, unit: int) -> Answer:
         time.sleep(0.5)
         return super().write(unit)
+
+
+class Steady(Renderer):
+    """Takes as long as a larger picture would, so that a run outlives who kills its members."""
+
+    def write(self, unit: int) -> Answer:
+        time.sleep(0.02)
+        return super().write(unit)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from pathlib import Path
 from typing import Any
 
 from weather_aug.errors import OutputError
@@ -46,7 +47,7 @@ def half_write_once(mark: Any) -> None:
     sync = os.fsync
 
     def deadly(descriptor: int) -> None:
-        path = os.readlink(f"/proc/self/fd/{descriptor}")
+        path = str(Path(f"/proc/self/fd/{descriptor}").readlink())
         if path.endswith(".tmp") and not mark.exists():
             os.ftruncate(descriptor, 100)
             mark.write_text(path)

@@ -38,7 +38,9 @@ def long_tree(long: ExportPlan, tmp_path_factory: pytest.TempPathFactory) -> dic
     return tree_of(out)
 
 
-def run_until(out: Path, plan: ExportPlan, how: Mapping[str, object], chance: random.Random) -> bool:
+def run_until(
+    out: Path, plan: ExportPlan, how: Mapping[str, object], chance: random.Random
+) -> bool:
     """Run an exporter until a random moment, then kill its whole group; False if it got through."""
     process = started(plan, out, **how)
     begun_s = time.monotonic()

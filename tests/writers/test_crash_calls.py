@@ -8,7 +8,6 @@ import os
 import resource
 import shutil
 import subprocess
-import sys
 from collections.abc import Mapping
 from itertools import count, cycle
 from pathlib import Path
@@ -216,7 +215,7 @@ def test_too_few_descriptors_are_named_and_it_can_be_continued(
         out = tmp_path / str(spare)
 
         def work(out: Path = out, spare: int = spare) -> int:
-            highest = max(int(name) for name in os.listdir("/proc/self/fd"))
+            highest = max(int(path.name) for path in Path("/proc/self/fd").iterdir())
             os.closerange(3, highest + 1)
             resource.setrlimit(resource.RLIMIT_NOFILE, (3 + spare, 3 + spare))
             return refused_with(small, out, "Too many open files")

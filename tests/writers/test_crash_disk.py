@@ -26,7 +26,9 @@ TOO_SMALL, ENOUGH = "240k", "8m"
 def mounted(*arguments: str) -> bool:
     """Whether the system did it."""
     try:
-        return subprocess.run(["mount", *arguments], capture_output=True, check=False).returncode == 0
+        return (
+            subprocess.run(["mount", *arguments], capture_output=True, check=False).returncode == 0
+        )
     except FileNotFoundError:
         return False
 

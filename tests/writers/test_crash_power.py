@@ -75,12 +75,12 @@ def test_after_a_power_cut_it_continues(
 
 
 def without_file_syncs(real: Callable[[int], None], descriptor: int) -> None:
-    if os.path.isdir(f"/proc/self/fd/{descriptor}"):
+    if Path(f"/proc/self/fd/{descriptor}").is_dir():
         real(descriptor)
 
 
 def without_folder_syncs(real: Callable[[int], None], descriptor: int) -> None:
-    if not os.path.isdir(f"/proc/self/fd/{descriptor}"):
+    if not Path(f"/proc/self/fd/{descriptor}").is_dir():
         real(descriptor)
 
 

@@ -34,11 +34,11 @@ pytestmark = pytest.mark.slow
 def clean(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Ray's files stand in a folder that goes; shared memory is as it was."""
     pytest.importorskip("ray", reason="ray is not installed")
-    shared = set(os.listdir("/dev/shm"))
+    shared = set(Path("/dev/shm").iterdir())
     with ray_folder() as folder:
         monkeypatch.setenv("RAY_TMPDIR", str(folder))
         yield
-    assert set(os.listdir("/dev/shm")) <= shared
+    assert set(Path("/dev/shm").iterdir()) <= shared
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from exporters import ray_folder
 from numpy.typing import NDArray
 from tiny_export import POLICY, tree_of
 
@@ -64,9 +65,16 @@ def run(plan: ExportPlan, out: Path, engine: Engine) -> ExportReport:
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_all_engines_give_one_tree(
-    layout_plan: ExportPlan, tree: dict[str, str], tmp_path: Path, engine: str
+    layout_plan: ExportPlan,
+    tree: dict[str, str],
+    tmp_path: Path,
+    engine: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert run(layout_plan, tmp_path / "out", ENGINES[engine]()).rendered == COUNT
+    with ray_folder() as folder:
+        monkeypatch.setenv("RAY_TMPDIR", str(folder))
+        report = run(layout_plan, tmp_path / "out", ENGINES[engine]())
+    assert report.rendered == COUNT
     assert tree_of(tmp_path / "out") == tree
     assert len(tree) == (2 * COUNT + 5 if layout_plan.layout.tar is None else 6)
     assert multiprocessing.active_children() == []

@@ -6,6 +6,7 @@ sample_class_stats.json  sample_class_stats_dict.json  samples_with_class.json  
 manifest.jsonl                                              one line a sample, in item order
 export.json                                                 the job, counts, digests
 .export/                                                    lock and journal, until it is done
+.export/shards/                                             those of each shard
 """
 
 from __future__ import annotations
@@ -31,6 +32,10 @@ SAMPLES_WITH_CLASS = "samples_with_class.json"
 STATE = ".export"
 JOURNAL = f"{STATE}/journal"
 QUARANTINE = f"{STATE}/quarantine.jsonl"
+SHARDS = f"{STATE}/shards"
+"""Each folder in it is the state of a shard, which looks as the export's own."""
+MARK = f"{STATE}/job.json"
+"""At a url, the job that is being written there."""
 
 PARTS = ("image", "label", "invalid", "transmittance", "depth")
 """What a sample may consist of; label, invalid and depth where the scene knows them."""

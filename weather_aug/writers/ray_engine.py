@@ -112,7 +112,7 @@ def run_ray(
                 yield from cast.finished()
         finally:
             cast.stop()
-    cast.losses.raise_if_any()
+    cast.losses.settle()
 
 
 class Renderer:

@@ -5,55 +5,62 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
 from weather_aug.cli.terminal import say
 from weather_aug.errors import DataError, IntegrityError, printable
 
+if TYPE_CHECKING:
+    from weather_aug.writers.source import Source
+
 
 @dataclass(frozen=True)
 class Inspect:
     """Say what a scene or an export holds, and whether every byte is the one written."""
 
-    path: Positional[Path]
-    """Scene or export folder."""
+    path: Positional[str]
+    """Scene or export folder, or the url of an export."""
 
     def run(self) -> None:
         """Print the contents, then verify; damage ends with exit code 4."""
+        from weather_aug.writers.source import source_of
+
         problems, cure = _inspected(self.path)
         for problem in problems:
             say(problem)
         if problems:
             count = f"{len(problems)} problem{'s' if len(problems) > 1 else ''}"
-            raise IntegrityError(f"{printable(self.path, 200)} is not whole ({count}); {cure}")
+            raise IntegrityError(f"{source_of(self.path)} is not whole ({count}); {cure}")
         say("every file is whole")
 
 
-def _inspected(path: Path) -> tuple[list[str], str]:
+def _inspected(path: str) -> tuple[list[str], str]:
     """What is wrong with a scene or an export, one sentence each, and the cure."""
     from weather_aug.scene import store
     from weather_aug.writers import layout
+    from weather_aug.writers.source import exists, is_url, source_of
     from weather_aug.writers.verify import verify_export
 
-    if (path / store.MANIFEST).is_file():
-        return _inspect_scene(path), "build the scene again"
-    if any((path / name).exists() for name in (layout.CONTENTS, layout.JOURNAL)):
-        return verify_export(path), _cure_of_export(path / layout.CONTENTS)
+    if not is_url(path) and (Path(path) / store.MANIFEST).is_file():
+        return _inspect_scene(Path(path)), "build the scene again"
+    source = source_of(path)
+    if any(exists(source, name) for name in (layout.CONTENTS, layout.JOURNAL, layout.MARK)):
+        return verify_export(source), _cure_of_export(source)
     raise DataError(
-        f"{printable(path, 200)} is neither a scene (no {store.MANIFEST}) nor an export (no "
-        f"{layout.CONTENTS})"
+        f"{source} is neither a scene (no {store.MANIFEST}) nor an export (no {layout.CONTENTS})"
     )
 
 
-def _cure_of_export(contents: Path) -> str:
+def _cure_of_export(source: Source) -> str:
     from weather_aug.writers import layout
+    from weather_aug.writers.source import contents_of, exists
 
     try:
-        if contents.exists():
-            layout.read_contents(contents.parent)
-    except (DataError, IntegrityError, OSError):
+        if exists(source, layout.CONTENTS):
+            contents_of(source)
+    except (DataError, IntegrityError):
         # Nobody knows any more which job it was.
         return "remove the folder and export again"
     return "run the same export again with --verify to repair it"

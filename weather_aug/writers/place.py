@@ -24,6 +24,8 @@ from weather_aug.errors import (
 
 # A password may hold a slash, where it should not; a port may be followed by one.
 _USER = re.compile(r"[^/]*@|[^/:@?]*:(?!\d+/).*@")
+_PART = 4
+"""Characters from which on a part of what is secret is no accident."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -144,10 +146,14 @@ class Place:
         return printable(text, 300)
 
     def _secrets(self) -> list[str]:
+        """What no message may hold, longer texts first; a file system may tell parts of them."""
         user, rest = self._parted
-        secrets = [user, user[:-1].partition(":")[2], rest.partition("?")[2]]
+        query = rest.partition("?")[2]
+        secrets = [user, user[:-1].partition(":")[2], query]
+        secrets += [part for part in re.split("[/@?:&=]", user + query) if len(part) >= _PART]
         secrets += [value for value in self.options.values() if isinstance(value, str)]
-        return [secret for text in secrets for secret in (text, unquote(text)) if secret]
+        told = {secret for text in secrets for secret in (text, unquote(text)) if secret}
+        return sorted(told, key=len, reverse=True)
 
     @property
     def _parted(self) -> tuple[str, str]:

@@ -19,7 +19,6 @@ from pathlib import Path
 from weather_aug import _files
 from weather_aug.errors import ConflictError, printable
 
-
 # Whoever looks for the name of a holder has the lock for a moment; that is waited for.
 _ATTEMPTS = 3
 _MOMENT_S = 0.02

@@ -147,7 +147,7 @@ def test_one_flipped_digit_is_no_answer(data: Path, val: Path, tmp_path: Path, p
 def test_a_lost_record_is_no_answer(data: Path, val: Path, tmp_path: Path, place: str) -> None:
     copy = Path(shutil.copytree(data / place, tmp_path / "copy", symlinks=place == "merged"))
     next(copy.rglob("*trained_on*")).unlink()
-    with pytest.raises((IntegrityError, DataError), match="missing|cannot read"):
+    with pytest.raises((IntegrityError, DataError), match=r"missing|cannot read"):
         trained_pictures(copy, val)
 
 
@@ -163,6 +163,21 @@ def test_an_adapter_that_lost_its_record_edits_nothing(data: Path, tmp_path: Pat
     with pytest.raises(DataError, match=r"trained_on\.txt is missing"):
         edited(tmp_path / "scene", copy)
     assert not (tmp_path / "scene").exists()
+
+
+def test_an_export_at_a_url_is_asked_too(
+    data: Path, val: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    url = f"file://{tmp_path}/out"
+    scene = WeatherScene.load(data / "scene")
+    export(plan_export([scene], POLICY, count=2, seed=3), url, state=tmp_path / "state")
+    assert told(url, val, capsys) == (0, ["none of 2 pictures trained the editor"])
+    shutil.copy(data / "pairs" / TRAINED, val / "c.png")
+    code, lines = told(url, val, capsys)
+    assert code == 4 and lines[0].startswith(f"{val}/c.png trained the editor diffusion ")
+    next((tmp_path / "out").glob("trained_on_*")).unlink()
+    code, lines = told(url, val, capsys)
+    assert code == 3 and "is missing" in lines[0]
 
 
 # Unknown is not clean
@@ -239,7 +254,9 @@ def test_what_is_nothing_of_ours_is_refused(data: Path, val: Path, tmp_path: Pat
 # The command
 
 
-def told(out: Path, against: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, list[str]]:
+def told(
+    out: Path | str, against: Path, capsys: pytest.CaptureFixture[str]
+) -> tuple[int, list[str]]:
     """Exit code, and the lines of both streams."""
     capsys.readouterr()
     code = 0

@@ -5,20 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
 from weather_aug.cli.terminal import say, to_people
 from weather_aug.errors import DataError, IntegrityError, printable
 
+if TYPE_CHECKING:
+    from weather_aug.writers.source import Source
+
 
 @dataclass(frozen=True)
 class Inspect:
     """Say what a scene or an export holds, and whether every byte is the one written."""
 
-    path: Positional[Path]
-    """Scene or export folder; with --against, a merge as well."""
+    path: Positional[str]
+    """Scene or export folder, or the url of an export; with --against, a merge as well."""
     against: Path | None = None
     """Pictures that a network shall be scored on, such as data/acdc/rgb_anon/val. Instead of
     comparing bytes, say which of them trained the editor of the backgrounds."""
@@ -32,18 +35,21 @@ class Inspect:
 
     def _verify(self) -> None:
         """Print the contents, then compare every byte."""
+        from weather_aug.writers.source import source_of
+
         problems, cure = _inspected(self.path)
         for problem in problems:
             say(problem)
         if problems:
             count = f"{len(problems)} problem{'s' if len(problems) > 1 else ''}"
-            raise IntegrityError(f"{printable(self.path, 200)} is not whole ({count}); {cure}")
+            raise IntegrityError(f"{source_of(self.path)} is not whole ({count}); {cure}")
         say("every file is whole")
 
 
-def _look_up(against: Path, path: Path) -> None:
+def _look_up(against: Path, path: str) -> None:
     """Say which pictures trained an editor of a scene, an export or a merge."""
     from weather_aug.writers.leakage import trained_pictures
+    from weather_aug.writers.source import source_of
 
     found = trained_pictures(path, against, progress=to_people())
     for sentence in (*found.trained, *found.unrecorded):
@@ -51,11 +57,11 @@ def _look_up(against: Path, path: Path) -> None:
     if found.trained:
         raise IntegrityError(
             f"{len(found.trained)} of {found.pictures} pictures of {printable(against, 200)} "
-            f"trained an editor of {printable(path, 200)}; score on others what learns from it"
+            f"trained an editor of {source_of(path)}; score on others what learns from it"
         )
     if found.unrecorded:
         raise IntegrityError(
-            f"not all that trained the editors of {printable(path, 200)} is known, and unknown is "
+            f"not all that trained the editors of {source_of(path)} is known, and unknown is "
             "not clean; build its scenes again with adapters that have their trained_on.txt"
         )
     editors = "the editor" if found.editors == 1 else f"one of the {found.editors} editors"
@@ -64,29 +70,31 @@ def _look_up(against: Path, path: Path) -> None:
     say(f"none of {found.pictures} pictures trained {editors}")
 
 
-def _inspected(path: Path) -> tuple[list[str], str]:
+def _inspected(path: str) -> tuple[list[str], str]:
     """What is wrong with a scene or an export, one sentence each, and the cure."""
     from weather_aug.scene import store
     from weather_aug.writers import layout
+    from weather_aug.writers.source import exists, is_url, source_of
     from weather_aug.writers.verify import verify_export
 
-    if (path / store.MANIFEST).is_file():
-        return _inspect_scene(path), "build the scene again"
-    if any((path / name).exists() for name in (layout.CONTENTS, layout.JOURNAL)):
-        return verify_export(path), _cure_of_export(path / layout.CONTENTS)
+    if not is_url(path) and (Path(path) / store.MANIFEST).is_file():
+        return _inspect_scene(Path(path)), "build the scene again"
+    source = source_of(path)
+    if any(exists(source, name) for name in (layout.CONTENTS, layout.JOURNAL, layout.MARK)):
+        return verify_export(source), _cure_of_export(source)
     raise DataError(
-        f"{printable(path, 200)} is neither a scene (no {store.MANIFEST}) nor an export (no "
-        f"{layout.CONTENTS})"
+        f"{source} is neither a scene (no {store.MANIFEST}) nor an export (no {layout.CONTENTS})"
     )
 
 
-def _cure_of_export(contents: Path) -> str:
+def _cure_of_export(source: Source) -> str:
     from weather_aug.writers import layout
+    from weather_aug.writers.source import contents_of, exists
 
     try:
-        if contents.exists():
-            layout.read_contents(contents.parent)
-    except (DataError, IntegrityError, OSError):
+        if exists(source, layout.CONTENTS):
+            contents_of(source)
+    except (DataError, IntegrityError):
         # Nobody knows any more which job it was.
         return "remove the folder and export again"
     return "run the same export again with --verify to repair it"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -28,6 +29,7 @@ SYNC_EVERY = 64
 """Lines between two syncs to disk: what a power cut can cost; a killed process loses none."""
 
 _SEAL_LENGTH = 16
+_ITEM = re.compile(rb'[0-9a-f]{16} \{"item": (\d+),')
 
 
 def sealed(text: str) -> bytes:
@@ -64,6 +66,16 @@ def write_journal(path: Path, job: dict[str, Any], lines: Iterable[str] = ()) ->
         file.write(sealed(json.dumps(job, allow_nan=False)))
         for line in lines:
             file.write(sealed(line))
+
+
+def committed_items(path: Path) -> Iterator[int]:
+    """Items of a journal's lines, as far as they are complete; nothing else of them is read."""
+    with path.open("rb") as file:
+        file.readline()
+        for line in file:
+            item = _ITEM.match(line)
+            if item is not None and line.endswith(b"\n"):
+                yield int(item[1])
 
 
 class WholeFiles:

@@ -174,10 +174,14 @@ def read_contents(out: Path) -> dict[str, Any]:
     """
     path = out / CONTENTS
     with path.open("rb") as file:
-        data = file.read(_files.MAX_JSON_BYTES + 1)
+        return checked_contents(file.read(_files.MAX_JSON_BYTES + 1), str(path))
+
+
+def checked_contents(data: bytes, path: str) -> dict[str, Any]:
+    """The fields of an `export.json`; see `read_contents`."""
     if len(data) > _files.MAX_JSON_BYTES:
         raise DataError(f"{printable(path, 200)} is larger than {_files.MAX_JSON_BYTES} bytes")
-    contents = _files.parse_json(data.decode(errors="replace"), str(path))
+    contents = _files.parse_json(data.decode(errors="replace"), path)
     if not isinstance(contents, dict) or contents.get("format") != FORMAT:
         raise IntegrityError(f"{printable(path, 200)} is not of a {FORMAT}")
     contents.pop("sha256", None)

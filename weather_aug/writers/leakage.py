@@ -13,13 +13,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from weather_aug.edit.diffusion.leakage import Digests, TrainedOn, digests_by_path, pictures_in
+from weather_aug.edit.diffusion.leakage import (
+    MAX_TRAINED_ON_BYTES,
+    Digests,
+    TrainedOn,
+    digests_by_path,
+    pictures_in,
+)
 from weather_aug.edit.editors import UNTRAINED
 from weather_aug.errors import DataError, printable
 from weather_aug.scene import store
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.writers import layout, merge
 from weather_aug.writers.editors import RECORD, editors_of
+from weather_aug.writers.source import Source, contents_of, exists, is_url, source_of
 
 
 class Leakage(NamedTuple):
@@ -44,14 +51,14 @@ class _Record(NamedTuple):
     digests: frozenset[str]
 
 
-def trained_pictures(out: Path, pictures: Path, *, progress: bool = False) -> Leakage:
+def trained_pictures(out: str | Path, pictures: Path, *, progress: bool = False) -> Leakage:
     """Look pictures up among those that trained the editors of a data set's backgrounds.
 
     Found are a picture's file, and its pixels in another file. A picture that was resized, cropped
     or compressed again has other pixels, and is not found.
 
     Args:
-        out: Scene, finished export, or merge.
+        out: Scene, finished export (a folder, or its url), or merge.
         pictures: Folder of pictures at any depth, such as a validation set, or one picture; they
             are read one by one.
         progress: Show a bar.
@@ -59,8 +66,9 @@ def trained_pictures(out: Path, pictures: Path, *, progress: bool = False) -> Le
     Raises:
         DataError: If `out` is none of them or malformed, or a picture or folder cannot be read.
         IntegrityError: If a record, or the file that names it, has changed since it was written.
+        OutputError: If a url does not answer.
     """
-    records, unrecorded = _records(Path(out))
+    records, unrecorded = _records(out)
     paths = list(pictures_in([Path(pictures)]))
     # Where nothing was learnt there is nothing to look up.
     looked_up = digests_by_path(paths, progress=progress) if records else ()
@@ -81,11 +89,11 @@ def _told(record: _Record, digests: Digests) -> str:
     return f"the editor {record.editor} (its {what} in {record.file})"
 
 
-def _records(out: Path) -> tuple[list[_Record], list[str]]:
+def _records(out: str | Path) -> tuple[list[_Record], list[str]]:
     """What trained the editors, and a sentence for each of which that is not known."""
     editors, read = _editors(out)
     if editors is None:
-        return [], [f"{printable(out, 200)} was made before exports named their editors"]
+        return [], [f"{source_of(out)} was made before exports named their editors"]
     try:
         records = [
             _Record(_shown(editor), str(editor["trained_on"]), read(editor["trained_on"]).digests)
@@ -99,7 +107,7 @@ def _records(out: Path) -> tuple[list[_Record], list[str]]:
         ]
     except (KeyError, TypeError, AttributeError) as error:
         raise DataError(
-            f"{printable(out, 200)}: its editors are malformed: {type(error).__name__} "
+            f"{source_of(out)}: its editors are malformed: {type(error).__name__} "
             f"{printable(error)}"
         ) from None
     return records, list(dict.fromkeys(unrecorded))
@@ -113,25 +121,22 @@ def _unknown(editor: Mapping[str, Any]) -> str:
     return f"{_shown(editor)} for {styles}" if styles else ""
 
 
-def _editors(out: Path) -> tuple[Any, Callable[[str], TrainedOn]]:
+def _editors(out: str | Path) -> tuple[Any, Callable[[Any], TrainedOn]]:
     """Editors as `editors_of` gives them, None if nobody noted them; and what reads a record."""
-    if (out / store.MANIFEST).is_file():
+    if not is_url(out) and (Path(out) / store.MANIFEST).is_file():
         scene = WeatherScene.load(out)
         return editors_of([scene]), lambda name: _of_scene(scene)
-    contents = _contents(out)
-    return contents.get("editors"), partial(_of_root, out, contents.get("files", {}))
-
-
-def _contents(out: Path) -> dict[str, Any]:
-    if (out / merge.CONTENTS).is_file():
-        return merge.read_merge(out)
-    try:
-        return layout.read_contents(out)
-    except OSError as error:
+    if not is_url(out) and (Path(out) / merge.CONTENTS).is_file():
+        contents = merge.read_merge(Path(out))
+        return contents.get("editors"), partial(_of_merge, Path(out), contents)
+    source = source_of(out)
+    if not exists(source, layout.CONTENTS):
         raise DataError(
-            f"{printable(out, 200)} is neither a scene nor a merge nor a finished export "
-            f"({layout.CONTENTS}: {error.strerror}); check the path"
-        ) from None
+            f"{source} is neither a scene nor a merge nor a finished export "
+            f"(no {layout.CONTENTS}); check the path"
+        )
+    contents = contents_of(source)
+    return contents.get("editors"), partial(_of_export, source, contents)
 
 
 def _of_scene(scene: WeatherScene) -> TrainedOn:
@@ -140,11 +145,22 @@ def _of_scene(scene: WeatherScene) -> TrainedOn:
     return record
 
 
-def _of_root(out: Path, files: Mapping[str, Any], name: Any) -> TrainedOn:
+def _of_merge(out: Path, contents: Mapping[str, Any], name: Any) -> TrainedOn:
+    """By its link; whatever that leads to must be what was written."""
+    return TrainedOn.read_file(out / name, _digest(contents, name))
+
+
+def _of_export(source: Source, contents: Mapping[str, Any], name: Any) -> TrainedOn:
+    sha256 = _digest(contents, name)
+    data = source.read(name, 0, min(source.size(name), MAX_TRAINED_ON_BYTES))
+    return TrainedOn.parse(data, f"{source}/{name}", sha256)
+
+
+def _digest(contents: Mapping[str, Any], name: Any) -> str:
+    """Of a record, as it was noted."""
     if not isinstance(name, str) or not RECORD.fullmatch(name):
-        raise DataError(f"{printable(out, 200)}: {printable(name)} is no name of a record")
-    # In a merge it is a link; whatever it leads to must be what was written.
-    return TrainedOn.read_file(out / name, str(files[name]["sha256"]))
+        raise DataError(f"an editor's record cannot be called {printable(name)}; export it again")
+    return str(contents["files"][name]["sha256"])
 
 
 def _shown(editor: Mapping[str, Any]) -> str:

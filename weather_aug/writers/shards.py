@@ -9,10 +9,10 @@ files, and removes all states.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from weather_aug._keys import check_seed
 from weather_aug.errors import ArgumentError
@@ -20,6 +20,7 @@ from weather_aug.writers import layout
 
 if TYPE_CHECKING:
     from weather_aug.writers.plan import ExportPlan
+    from weather_aug.writers.target import Target
 
 MAX_SHARDS = 99_999
 
@@ -82,6 +83,33 @@ class Shard:
 
 WHOLE = Shard(1, 1)
 """All units."""
+
+
+@dataclass(frozen=True)
+class ShardTarget:
+    """A target as one of several shards uses it; see `Target`."""
+
+    whole: Target
+    state: Path
+    """Folder of this shard's lock, fence and journal."""
+
+    def write_whole(self, relative: str, data: bytes) -> None:
+        """As the target does."""
+        self.whole.write_whole(relative, data)
+
+    def is_whole(self, relative: str, stored: dict[str, Any], *, digests: bool) -> bool:
+        """As the target does."""
+        return self.whole.is_whole(relative, stored, digests=digests)
+
+    def make_folders(self, relatives: Iterable[str]) -> None:
+        """As the target does."""
+        self.whole.make_folders(relatives)
+
+    def remove_leftovers(self, layout: layout.Layout) -> None:
+        """Remove nothing: a temporary file may be one that another shard writes just now."""
+
+    def __str__(self) -> str:
+        return str(self.whole)
 
 
 def shard_journals(out: Path) -> list[Path]:

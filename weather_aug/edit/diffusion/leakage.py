@@ -219,6 +219,11 @@ class TrainedOn:
             data = path.read_bytes()
         except OSError as error:
             raise DataError(f"cannot read {printable(path, 200)}: {error.strerror}") from None
+        return cls.parse(data, str(path), sha256)
+
+    @classmethod
+    def parse(cls, data: bytes, path: str, sha256: str | None = None) -> TrainedOn:
+        """A record's bytes as a record; `path` is named in errors. See `read_file`."""
         if sha256 not in (None, _files.sha256_of(data)):
             raise IntegrityError(
                 f"{printable(path, 200)} has changed since it was written; take the file as it was"

@@ -57,7 +57,7 @@ def _look_up(against: Path, path: str) -> None:
     if found.trained:
         raise IntegrityError(
             f"{len(found.trained)} of {found.pictures} pictures of {printable(against, 200)} "
-            f"trained an editor of {source_of(path)}; score on others what learns from it"
+            f"trained an editor of {source_of(path)}; do not score on them what learns from it"
         )
     if found.unrecorded:
         raise IntegrityError(

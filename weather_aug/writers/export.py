@@ -119,7 +119,7 @@ def export(
                 damaged = journal.damaged
                 target.make_folders(plan.folders())
                 rendered = _render(plan, target, journal, run, progress, on_sample)
-                contents = finish(plan, target, journal)
+                contents = finish(plan, target, journal, progress=progress)
         if remote is not None:
             remote.publish([*contents["files"], layout.CONTENTS])
         with _files.reported(target.state):

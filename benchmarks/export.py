@@ -24,7 +24,7 @@ from weather_aug.scene.scene import WeatherScene
 
 MOST_MIB = 256.0
 MILLION = 1_000_000
-FEW, SOME = 3_000, 30_000
+FEW, SOME = 2_000, 20_000
 
 
 def measure(counts: Sequence[int] = (FEW, SOME)) -> dict[str, Any]:
@@ -33,9 +33,9 @@ def measure(counts: Sequence[int] = (FEW, SOME)) -> dict[str, Any]:
     Args:
         counts: Samples of the exports that are led without rendering; they rise.
     """
-    shares = export_share.measure()
     with tempfile.TemporaryDirectory() as folder:
         scene = WeatherScene.build(OneFrameClip(), Path(folder) / "scene")
+        shares = export_share.measure(scene)
         workers = alone(export_workers.__name__, scene.path)
         parents = alone(export_parent.__name__, scene.path, *counts)
     return {

@@ -16,9 +16,10 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from statistics import fmean, median
 from typing import Any, NamedTuple
@@ -46,10 +47,16 @@ PLANNED = 4096
 """Samples of the plan that items of each kind are looked for in."""
 DEFAULT = "default policy"
 EXPORT, PEER = "export", "peer"
-MEMORY, JOB = "in memory", "whole job"
+PARTS = MEMORY, JOB = "in memory", "whole job"
 
 
-class Moment(NamedTuple):
+class Dressed(Physical):
+    """The physical editor as one that stores backgrounds; its own name means that none are."""
+
+    name = "dressed"
+
+
+class Clocks(NamedTuple):
     """Two clocks at one moment."""
 
     cpu_s: float
@@ -61,16 +68,16 @@ Spent = Mapping[str, tuple[float, float]]
 """Processor and wall milliseconds of a call: until it began to write, and in all."""
 
 
-def now() -> Moment:
+def now() -> Clocks:
     """Both clocks."""
-    return Moment(time.thread_time(), time.perf_counter())
+    return Clocks(time.thread_time(), time.perf_counter())
 
 
 @dataclass(frozen=True)
 class ClockedFolder(LocalFolder):
     """A folder that notes when the first byte of a sample is about to be written."""
 
-    begun: list[Moment] = field(default_factory=list)
+    begun: list[Clocks] = field(default_factory=list)
 
     def write_whole(self, relative: str, data: bytes) -> None:
         """As a folder does."""
@@ -123,11 +130,14 @@ def _pixels(parts: Mapping[str, bytes]) -> dict[str, NDArray[Any]]:
     }
 
 
-def measure() -> list[dict[str, Any]]:
-    """Print what weather costs an export, of a scene with stored layers and with backgrounds."""
+def measure(layers: WeatherScene) -> list[dict[str, Any]]:
+    """Print what weather costs an export, of a scene with stored layers and with backgrounds.
+
+    Args:
+        layers: The benchmark's scene as the physical editor's, which dresses while it renders.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        layers = WeatherScene.build(OneFrameClip(), Path(folder) / "layers")
-        stored = WeatherScene.build(OneFrameClip(), Path(folder) / "stored", editor=Physical())
+        stored = WeatherScene.build(OneFrameClip(), Path(folder) / "stored", editor=Dressed())
         return [
             _measured(layers, WeatherPolicy(), 4, "stored layers"),
             # A clear picture has no background.
@@ -164,28 +174,37 @@ Times = dict[str, dict[str, dict[str, tuple[float, float]]]]
 def milliseconds(plan: ExportPlan, items: Mapping[str, Sequence[int]], rounds: int) -> Times:
     """Time both sides in turns."""
     every = [item for some in items.values() for item in some]
+    turns: dict[tuple[str, int], list[Spent]] = {}
     with two_folders(plan) as (ours, theirs):
         peer = Peer(plan, every)
-        turns: dict[tuple[int, str], list[Spent]] = {}
         for _ in range(rounds):
             for item in every:
-                for side, target in ((EXPORT, ours), (PEER, theirs)):
-                    target.begun.clear()
-                    start = now()
-                    if side == EXPORT:
-                        write_sample(plan, target, item)
-                    else:
-                        peer.write(target, item)
-                    spent = {MEMORY: _ms(start, target.begun[0]), JOB: _ms(start, now())}
-                    turns.setdefault((item, side), []).append(spent)
+                ours_now = _spent(partial(write_sample, plan, ours, item), ours)
+                theirs_now = _spent(partial(peer.write, theirs, item), theirs)
+                turns.setdefault((EXPORT, item), []).append(ours_now)
+                turns.setdefault((PEER, item), []).append(theirs_now)
+
+    def mean(side: str, kind: str, part: str) -> tuple[float, float]:
+        cpu, wall = (
+            fmean(median(spent[part][clock] for spent in turns[side, item]) for item in items[kind])
+            for clock in (0, 1)
+        )
+        return cpu, wall
+
     return {
-        kind: {
-            side: {
-                part: _mean([turns[item, side] for item in some], part) for part in (MEMORY, JOB)
-            }
-            for side in (EXPORT, PEER)
-        }
-        for kind, some in items.items()
+        kind: {side: {part: mean(side, kind, part) for part in PARTS} for side in (EXPORT, PEER)}
+        for kind in items
+    }
+
+
+def _spent(run: Callable[[], object], target: ClockedFolder) -> Spent:
+    target.begun.clear()
+    start = now()
+    run()
+    end = now()
+    return {
+        part: (1e3 * (until.cpu_s - start.cpu_s), 1e3 * (until.wall_s - start.wall_s))
+        for part, until in zip(PARTS, (target.begun[0], end), strict=True)
     }
 
 
@@ -200,27 +219,16 @@ def two_folders(plan: ExportPlan) -> Iterator[tuple[ClockedFolder, ClockedFolder
         yield places[0], places[1]
 
 
-def _ms(start: Moment, end: Moment) -> tuple[float, float]:
-    return 1e3 * (end.cpu_s - start.cpu_s), 1e3 * (end.wall_s - start.wall_s)
-
-
-def _mean(turns: Sequence[Sequence[Spent]], part: str) -> tuple[float, float]:
-    """Over items, of the median over rounds."""
-    cpu, wall = (fmean(median(t[part][clock] for t in some) for some in turns) for clock in (0, 1))
-    return cpu, wall
-
-
 def rows_of(ms: Times, shares: Mapping[str, float]) -> list[Row]:
     """Shares in percent of both clocks, samples per second on the wall; `shares` by kind."""
     whole = {
-        side: {part: _weighted(ms, shares, side, part) for part in (MEMORY, JOB)}
-        for side in (EXPORT, PEER)
+        side: {part: _weighted(ms, shares, side, part) for part in PARTS} for side in (EXPORT, PEER)
     }
     name = "all kinds" if "clear" not in shares else DEFAULT
-    met = MOST_SHARE_PERCENT if name == DEFAULT else None
+    most = MOST_SHARE_PERCENT if name == DEFAULT else None
     rows = [
-        Row(f"{name}, whole job", _percent(whole, JOB, 0), "% of processor", at_most=met),
-        Row(f"{name}, in memory", _percent(whole, MEMORY, 0), "% of processor", at_most=met),
+        Row(f"{name}, whole job", _percent(whole, JOB, 0), "% of processor", at_most=most),
+        Row(f"{name}, in memory", _percent(whole, MEMORY, 0), "% of processor", at_most=most),
         Row(f"{name}, whole job", _percent(whole, JOB, 1), "% on the wall"),
     ]
     for kind, sides in ms.items():
@@ -246,8 +254,3 @@ def _percent(
 ) -> float:
     ours, theirs = (sides[side][part][clock] for side in (EXPORT, PEER))
     return 100 * (ours - theirs) / ours
-
-
-if __name__ == "__main__":
-    cv2.setNumThreads(1)
-    measure()

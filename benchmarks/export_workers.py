@@ -31,7 +31,7 @@ from weather_aug.writers.export import export
 from weather_aug.writers.plan import ExportPlan, plan_export
 
 PLANNED = 1_000_000
-SETTLING, COUNTED = 8, 16
+SETTLING, COUNTED = 8, 14
 ROUNDS = 2
 WORKERS = (1, 2)
 

@@ -8,7 +8,7 @@ import os
 import socket
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from weather_aug import _files
@@ -57,18 +57,18 @@ def _acquired(path: Path, busy: str) -> int:
                 descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
             except FileNotFoundError:
                 continue
-            if not try_lock(descriptor, fcntl.LOCK_EX):
-                os.close(descriptor)
-                raise ConflictError(
-                    f"{busy} by {_holder_of(path)}; wait for it, or choose another folder"
-                )
-            if _is_still(path, descriptor):
-                break
-            # The last holder finished and removed the file between our open and our lock.
-            os.close(descriptor)
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, _own_name(), 0)
-    return descriptor
+            with ExitStack() as opened:
+                opened.callback(os.close, descriptor)
+                if not try_lock(descriptor, fcntl.LOCK_EX):
+                    raise ConflictError(
+                        f"{busy} by {_holder_of(path)}; wait for it, or choose another folder"
+                    )
+                # Else the last holder removed the file between our open and our lock.
+                if _is_still(path, descriptor):
+                    os.ftruncate(descriptor, 0)
+                    os.pwrite(descriptor, _own_name(), 0)
+                    opened.pop_all()
+                    return descriptor
 
 
 def _is_still(path: Path, descriptor: int) -> bool:

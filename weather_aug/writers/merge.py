@@ -49,7 +49,7 @@ MAX_STATS_BYTES = 256 * 2**20
 
 _LOCK = ".merge.lock"
 _STATS = (layout.CLASS_STATS, layout.CLASS_STATS_DICT, layout.SAMPLES_WITH_CLASS)
-_OWN = {CONTENTS, _LOCK, *_STATS, *(name + _files.TEMPORARY_SUFFIX for name in (CONTENTS, *_STATS))}
+_OWN = {CONTENTS, _LOCK, *_STATS}
 _IMAGE, _LABEL = "_leftImg8bit.png", "_gtFine_labelTrainIds.png"
 
 
@@ -124,6 +124,7 @@ def merge_cityscapes(
     busy = f"{printable(out, 200)} is being merged"
     with _lock.exclusive(out / _LOCK, busy), _files.reported(out):
         try:
+            _files.remove_temporaries(out)
             foreign = _foreign_file(out, merged.files)
             if foreign is not None:
                 raise ConflictError(

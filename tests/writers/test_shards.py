@@ -144,6 +144,21 @@ def test_a_finished_export_has_nothing_to_do_for_a_shard(
     assert tree_of(out) == expected_tree
 
 
+def test_what_is_finished_while_a_shard_asks_is_left_clean(
+    plan: ExportPlan, out: Path, expected_tree: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    export(plan, out)
+    finished = export_module._finished_before
+    answers = iter([None])
+    monkeypatch.setattr(
+        export_module, "_finished_before", lambda *given: next(answers, finished(*given))
+    )
+    assert export(plan, out, shard=(1, 2)).finished
+    assert next(answers, "asked again") == "asked again"
+    assert tree_of(out) == expected_tree
+    assert not (out / ".export").exists()
+
+
 def test_tars_are_the_units(
     scene: WeatherScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,8 +11,8 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import closing
-from dataclasses import dataclass
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -175,7 +175,7 @@ def _whole(task: _Task, verify: bool) -> _Done:
                 damaged = journal.damaged
                 target.make_folders(plan.folders())
                 rendered = _render(task, target, journal)
-                contents = finish(plan, target, journal)
+                contents = finish(plan, target, journal, progress=task.progress)
         if remote is not None:
             remote.publish([*contents["files"], layout.CONTENTS])
         with _files.reported(target.state):
@@ -187,27 +187,36 @@ def _whole(task: _Task, verify: bool) -> _Done:
 def _part(task: _Task, shard: Shard) -> _Done:
     """A shard's run: it commits its samples to a journal of its own, and nothing else."""
     plan, target = task.plan, task.target
-    state = shard.state(target.state)
-    # Nothing of a finished export is touched, but who waits for nobody may find it finished now.
-    if (done := _finished_before(plan, target)) is not None:
+    done = _finished_before(plan, target)
+    if done is not None:
         return done
-    with shared(target.state, state, str(shard)):
-        if (done := _finished_before(plan, target)) is not None:
-            return done
-        _check_place(plan, target)
-        # The output's own journal says whose it is; the ordinary run fills it.
-        _claim(plan, target.state)
-        others = _of_job(plan, shard.foreign_journals(target.state))
-        _claim(plan, state)
-        if isinstance(target, FsspecFolder):
-            target.begin(plan.job)
-        own = ShardTarget(target, state)
-        with Journal(plan, own, shard, others, progress=task.progress) as journal:
-            own.make_folders(plan.folders())
-            rendered = _render(task, own, journal)
-            counts = _counted(plan, shard, journal)
-        with _files.reported(state):
-            (state / layout.QUARANTINE).unlink(missing_ok=True)
+    with shared(target.state, shard.state(target.state), str(shard)):
+        done = _finished_before(plan, target)
+        if done is None:
+            return _rendered_part(task, shard)
+    # It was finished just before the lock was held: what holding it made is removed by the last.
+    with suppress(ConflictError), exclusive(target.state):
+        pass
+    return done
+
+
+def _rendered_part(task: _Task, shard: Shard) -> _Done:
+    """Render what the journals of an unfinished export miss of a shard."""
+    plan, target = task.plan, task.target
+    own = ShardTarget(target, shard.state(target.state))
+    _check_place(plan, target)
+    # The output's own journal says whose it is; the ordinary run fills it.
+    _claim(plan, target.state)
+    others = _of_job(plan, shard.foreign_journals(target.state))
+    _claim(plan, own.state)
+    if isinstance(target, FsspecFolder):
+        target.begin(plan.job)
+    with Journal(plan, own, shard, others, progress=task.progress) as journal:
+        own.make_folders(plan.folders())
+        rendered = _render(task, own, journal)
+        counts = _counted(plan, shard, journal)
+    with _files.reported(own.state):
+        (own.state / layout.QUARANTINE).unlink(missing_ok=True)
     return _Done(counts, rendered, journal.damaged, False)
 
 
@@ -365,8 +374,8 @@ def export_target(
     scenes = [scene.path for scene in plan.scenes]
     place = state_of(out, state)
     if is_url(out):
-        FsspecFolder(str(out), place, options or {})
-        return FsspecFolder(str(out), check_output(place, scenes), options or {})
+        folder = FsspecFolder(str(out), place, options or {})
+        return replace(folder, state=check_output(place, scenes))
     if options is not None:
         raise ArgumentError(f"storage_options are for a url; {printable(out, 200)} is a folder")
     return LocalFolder(check_output(place, scenes))

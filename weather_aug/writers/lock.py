@@ -45,6 +45,9 @@ def exclusive(out: Path) -> Iterator[None]:
         finally:
             if not (out / layout.JOURNAL).exists():
                 _remove(state)
+    # On NFS the lock kept its folder while it was open.
+    with suppress(OSError):
+        state.rmdir()
 
 
 @contextmanager

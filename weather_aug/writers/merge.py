@@ -445,5 +445,5 @@ def _written_stats(out: Path, labels: Mapping[str, Mapping[str, int]]) -> ClassS
     stats = ClassStats(len(paths))
     for index, pixels in enumerate(labels.values()):
         stats.add(index, pixels)
-    stats.write(out, lambda index: paths[index])
+    stats.write(out, lambda: paths)
     return stats

@@ -134,7 +134,7 @@ def written_sheet(out: Readable, written: Written, *, tile_width: int = 480) -> 
     shares = written.shares
     if shares is not None:
         whose = f"{written.counted} of {written.labelled} labels"
-        title = f"share of pixels by class, {whose}, read back from disk; logarithmic"
+        title = f"share of pixels by class, {whose}, read back; logarithmic"
         blocks.append(class_histogram(shares, width=max(width, 640), title=title))
     return _stacked(blocks)
 

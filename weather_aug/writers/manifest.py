@@ -14,6 +14,7 @@ from weather_aug import _files
 from weather_aug.errors import DataError
 from weather_aug.writers import layout
 from weather_aug.writers.cityscapes import ClassStats
+from weather_aug.writers.editors import editors_of, write_records
 from weather_aug.writers.journal import Journal, WholeFiles
 from weather_aug.writers.plan import ExportPlan
 from weather_aug.writers.target import Target
@@ -34,6 +35,7 @@ def finish(
         The fields of `export.json`.
 
     Raises:
+        IntegrityError: If a scene's record of what trained its editor has changed.
         OutputError: If a file cannot be written.
     """
     from tqdm.auto import tqdm
@@ -67,8 +69,8 @@ def finish(
         "samples_by_kind": dict(sorted(kinds.items())),
         "classes": list(stats.kept),
         "dropped_classes": list(stats.dropped),
-        "editors": _editors(plan),
-        "files": {name: _stored(out / name) for name in names},
+        "editors": editors_of(plan.scenes),
+        "files": {name: _stored(out / name) for name in names + write_records(plan.scenes, out)},
     }
     _files.write_whole(out / layout.CONTENTS, layout.sealed_contents(contents))
     return contents
@@ -102,18 +104,6 @@ def _label_paths(folder: Path) -> Iterator[_LabelPaths]:
         tempfile.TemporaryFile("w+", encoding="utf-8", dir=folder) as file,
     ):
         yield _LabelPaths(file)
-
-
-def _editors(plan: ExportPlan) -> list[dict[str, Any]]:
-    """Editors of the scenes' stored backgrounds, each once; their cards say what trained them."""
-    made: list[dict[str, Any]] = []
-    for scene in plan.scenes:
-        record = scene.manifest.backgrounds
-        if record is not None:
-            editor = {"editor": scene.manifest.editor, "card": dict(record.card)}
-            if editor not in made:
-                made.append(editor)
-    return made
 
 
 def is_finished_whole(

@@ -144,18 +144,27 @@ def parse_json(text: str, where: str) -> Any:
         raise DataError(f"{printable(where, 200)} is not valid JSON: {cause}") from None
 
 
+def check_plain(root: object, relative: str) -> tuple[str, ...]:
+    """The parts of a path below `root`, of which none leads elsewhere.
+
+    Raises:
+        DataError: If the path is not plain and relative.
+    """
+    parts = PurePosixPath(relative).parts
+    plain = isinstance(relative, str) and parts and "/".join(parts) == relative
+    if not plain or any(p in ("..", ".", "/") or "\\" in p or "\0" in p for p in parts):
+        raise DataError(f"{printable(root, 200)}: {printable(relative)!r} is not a plain path")
+    return parts
+
+
 def file_inside(root: Path, relative: str) -> Path:
     """The regular file that `relative` names below `root`; links and ways out are refused.
 
     Raises:
         DataError: If the path is not plain and relative, or no regular file is there.
     """
-    parts = PurePosixPath(relative).parts
-    plain = isinstance(relative, str) and parts and "/".join(parts) == relative
-    if not plain or any(p in ("..", ".", "/") or "\\" in p or "\0" in p for p in parts):
-        raise DataError(f"{printable(root, 200)}: {printable(relative)!r} is not a plain path")
     path = root
-    for part in parts:
+    for part in check_plain(root, relative):
         path = path / part
         try:
             mode = path.lstat().st_mode

@@ -13,7 +13,7 @@ import os
 import socket
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from weather_aug import _files
@@ -86,15 +86,17 @@ def _acquired(path: Path, mode: int, busy: str, sharers: Iterable[Path]) -> int:
                 descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
             except FileNotFoundError:
                 continue
-            if not _lock_soon(descriptor, mode):
-                os.close(descriptor)
-                holder = _holder_of(next(filter(_is_held, sharers), path))
-                raise ConflictError(f"{busy} by {holder}; wait for it, or choose another folder")
-            if _is_still(path, descriptor):
-                break
-            # The last holder finished and removed the file between our open and our lock.
-            os.close(descriptor)
-    return descriptor
+            with ExitStack() as opened:
+                opened.callback(os.close, descriptor)
+                if not _lock_soon(descriptor, mode):
+                    holder = _holder_of(next(filter(_is_held, sharers), path))
+                    raise ConflictError(
+                        f"{busy} by {holder}; wait for it, or choose another folder"
+                    )
+                # Else the last holder removed the file between our open and our lock.
+                if _is_still(path, descriptor):
+                    opened.pop_all()
+                    return descriptor
 
 
 def _lock_soon(descriptor: int, mode: int) -> bool:

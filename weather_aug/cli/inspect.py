@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from weather_aug.cli.terminal import say
+from weather_aug.cli.terminal import say, to_people
 from weather_aug.errors import DataError, IntegrityError, printable
 
 if TYPE_CHECKING:
@@ -21,10 +21,20 @@ class Inspect:
     """Say what a scene or an export holds, and whether every byte is the one written."""
 
     path: Positional[str]
-    """Scene or export folder, or the url of an export."""
+    """Scene or export folder, or the url of an export; with --against, a merge as well."""
+    against: Path | None = None
+    """Pictures that a network shall be scored on, such as data/acdc/rgb_anon/val. Instead of
+    comparing bytes, say which of them trained the editor of the backgrounds."""
 
     def run(self) -> None:
-        """Print the contents, then verify; damage ends with exit code 4."""
+        """Say what is asked; damage, leakage and editors of unknown origin end with exit code 4."""
+        if self.against is None:
+            self._verify()
+        else:
+            _look_up(self.against, self.path)
+
+    def _verify(self) -> None:
+        """Print the contents, then compare every byte."""
         from weather_aug.writers.source import source_of
 
         problems, cure = _inspected(self.path)
@@ -34,6 +44,30 @@ class Inspect:
             count = f"{len(problems)} problem{'s' if len(problems) > 1 else ''}"
             raise IntegrityError(f"{source_of(self.path)} is not whole ({count}); {cure}")
         say("every file is whole")
+
+
+def _look_up(against: Path, path: str) -> None:
+    """Say which pictures trained an editor of a scene, an export or a merge."""
+    from weather_aug.writers.leakage import trained_pictures
+    from weather_aug.writers.source import source_of
+
+    found = trained_pictures(path, against, progress=to_people())
+    for sentence in (*found.trained, *found.unrecorded):
+        say(sentence)
+    if found.trained:
+        raise IntegrityError(
+            f"{len(found.trained)} of {found.pictures} pictures of {printable(against, 200)} "
+            f"trained an editor of {source_of(path)}; do not score on them what learns from it"
+        )
+    if found.unrecorded:
+        raise IntegrityError(
+            f"not all that trained the editors of {source_of(path)} is known, and unknown is "
+            "not clean; build its scenes again with adapters that have their trained_on.txt"
+        )
+    editors = "the editor" if found.editors == 1 else f"one of the {found.editors} editors"
+    if not found.editors:
+        editors = "an editor: none of the backgrounds is learnt"
+    say(f"none of {found.pictures} pictures trained {editors}")
 
 
 def _inspected(path: str) -> tuple[list[str], str]:

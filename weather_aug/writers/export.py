@@ -175,7 +175,7 @@ def _whole(task: _Task, verify: bool) -> _Done:
                 damaged = journal.damaged
                 target.make_folders(plan.folders())
                 rendered = _render(task, target, journal)
-                contents = finish(plan, target, journal)
+                contents = finish(plan, target, journal, progress=task.progress)
         if remote is not None:
             remote.publish([*contents["files"], layout.CONTENTS])
         with _files.reported(target.state):

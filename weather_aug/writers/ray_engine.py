@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import faulthandler
 import json
+import logging
 import os
 import signal
 import socket
@@ -303,6 +304,7 @@ def _connected(address: str | None, local_cpus: int) -> Iterator[ModuleType]:
         before = dict(os.environ)
         ray = require("ray", extra="ray", to="export with Ray actors")
         if not ray.is_initialized():
+            undone.enter_context(_without_warnings())
             try:
                 _connect(ray, address, local_cpus)
             finally:
@@ -353,6 +355,18 @@ def _undo_environment(before: dict[str, str], during: dict[str, str]) -> None:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = old
+
+
+@contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Keep advice to who runs a cluster off stderr, where this package says one sentence."""
+    logger = logging.getLogger("ray")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 @contextmanager

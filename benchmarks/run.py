@@ -1,6 +1,7 @@
 """Print all ratios: `make bench`. Interleaved medians of processor time in one process on one core.
 
-The DataLoader's are of the time on the wall, with two workers of one thread each.
+The DataLoader's and the export's of workers are of the time on the wall, with two workers of one
+thread each.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import torch
 from benchmarks import (
     crowds,
     editing,
+    export,
     fidelity,
     gaussians,
     gaussians_plot,
@@ -45,6 +47,7 @@ def main() -> None:
         "fidelity": fidelity.measure(),
         "sample": sample.measure(),
         "loader": loader.measure(),
+        "export": export.measure(),
         "stages": stages.measure(),
         "growth": growth.measure(),
         "gaussians": gaussians.measure(),

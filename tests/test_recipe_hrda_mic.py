@@ -1,6 +1,6 @@
 """Configs for HRDA and MIC: merged by mmcv's rules, and loaded by the trainers' rules.
 
-The checkouts are stand-ins, see `trainer_checkout`; no real one was run.
+The checkouts are stand-ins, see `trainer_checkout`; for clones see `writers/test_real_checkout.py`.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ def refused(done: subprocess.CompletedProcess[str]) -> str:
 def as_started(checkout: Path, done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
     """The config that a trainer sees when the printed command is run: a child of the one written.
 
-    run_experiments.py writes it to configs/generated/<name>/ with `_base_` made from the given path
-    by replacing "configs" with "../..".
+    run_experiments.py writes it to configs/generated/<name>/ (HRDA as JSON, MIC as Python) with
+    `_base_` made from the given path by replacing "configs" with "../..".
     """
     root, given = (line.split()[-1] for line in done.stdout.splitlines()[-2:])
     assert Path(root) == (checkout / "seg" if checkout.name == "mic" else checkout)
@@ -122,9 +122,14 @@ def test_without_a_target_the_branch_dg_trains_on_the_export_alone(
 ) -> None:
     checkout = checkout_in(tmp_path, "hrda-dg")
     config = as_started(checkout, run("source-only", finished(), checkout))
-    assert config["data"]["train"]["type"] == "DGDataset"
+    train = config["data"]["train"]
+    alone = train.pop("dataset")
+    assert train == {"type": "RepeatDataset", "times": 20_000}, "4 samples, 80,000 are drawn"
+    assert alone["type"] == "DGDataset"
+    assert alone["rare_class_sampling"]["min_pixels"] == 3000
+    assert alone["source"]["pipeline"][2] == {"type": "Resize", "img_scale": (2048, 1024)}
     assert config["uda"]["source_only"] is True
-    assert len(Pictures.of(config["data"]["train"]["source"])) == 4
+    assert len(Pictures.of(alone["source"])) == 4
     for other, cure in (("hrda", "checkout dg"), ("mic", "use HRDA, branch dg")):
         line = refused(run("source-only", finished(), checkout_in(tmp_path, other)))
         assert cure in line
@@ -177,6 +182,8 @@ def test_all_else_stays_as_the_authors_have_it(
 def test_what_was_not_checked_is_said(finished: Callable[..., Path], tmp_path: Path) -> None:
     said = run("source", finished(), checkout_in(tmp_path, "hrda")).stdout
     assert "4 pictures of 128x96 are resized to 1365x1024; enlarged 10.7 times" in said
+    assert "4 samples make 6400 pairs with 1600 pictures; after 3200 iterations" in said
+    assert "export 50 or more" in said
     assert "train ids 13 occur, but never with more than 3000 pixels" in said
     assert "not checked here, because nothing of the checkout was run:" in said
     assert "pretrained/mit_b5.pth is not in the checkout" in said
@@ -228,6 +235,14 @@ def a_picture_more(data: Path) -> None:
     shutil.copy(path, path.with_name("mine_leftImg8bit.png"))
 
 
+def hidden(data: Path) -> None:
+    (data / "leftImg8bit" / "train" / ".DS_Store").write_text("")
+
+
+def dangling(data: Path) -> None:
+    (data / "leftImg8bit" / "train" / "more").symlink_to("nowhere")
+
+
 def cut_short(data: Path) -> None:
     with first(data, "leftImg8bit").open("ab") as file:
         file.truncate(100)
@@ -244,6 +259,8 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "label in colour": (label_in_colour, "is no label of one channel"),
     "cut short": (cut_short, "is not whole"),
     "a picture more": (a_picture_more, "holds 5 pictures, the export made 4"),
+    "hidden": (hidden, "is a hidden file, at which the loaders stop"),
+    "dangling": (dangling, "is a link that leads nowhere"),
     "no statistics": (lambda d: (d / "sample_class_stats.json").unlink(), "cannot be read"),
     "statistics": (lambda d: (d / "samples_with_class.json").write_text("{}"), "has changed"),
 }
@@ -321,6 +338,37 @@ def test_a_checkout_that_is_none_is_refused(finished: Callable[..., Path], tmp_p
     assert "has no data.train.source.ann_dir" in refused(run("source", finished(), checkout))
     dataset.unlink()
     assert "newest commit" in refused(run("source", finished(), checkout))
+
+
+def test_a_clone_that_cannot_start_a_config_is_refused(
+    finished: Callable[..., Path], tmp_path: Path
+) -> None:
+    checkout = checkout_in(tmp_path, "mic")
+    (checkout / "seg/run_experiments.py").write_text("f.write(Config(child_cfg).pretty_text)\n")
+    assert run("source", finished(), checkout).returncode == 0
+    (checkout / "seg/run_experiments.py").write_text("f.write(child_cfg.pretty_text)\n")
+    assert "older than the authors' fix" in refused(run("source", finished(), checkout))
+
+
+@pytest.mark.parametrize(
+    ("samples", "role", "said"),
+    [
+        (49, "source", "export 50 or more"),
+        (50, "source", None),
+        (60_000, "source", None),
+        (100_000, "source", "the order of 100000 x 1600 pairs takes 6 GB"),
+        (26, "target", "export 27 or more"),
+        (1_000_000, "target", "pairs takes 119 GB"),
+        (4, "source-only", None),
+    ],
+)
+def test_an_epoch_that_is_too_short_or_too_large_is_noted(
+    samples: int, role: str, said: str | None
+) -> None:
+    code = f"import settings; print(*settings.pair_notes({samples}, {role!r}), sep='\\n')"
+    command = [sys.executable, "-B", "-c", code]
+    done = subprocess.run(command, cwd=RECIPE, capture_output=True, text=True, check=True)
+    assert (said in done.stdout) if said else not done.stdout.strip()
 
 
 def test_a_config_that_could_not_be_started_is_refused(

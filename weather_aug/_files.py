@@ -6,6 +6,7 @@ import errno
 import hashlib
 import json
 import os
+import re
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +17,9 @@ from weather_aug.errors import DataError, OutputError, printable
 
 TEMPORARY_SUFFIX = ".tmp"
 MAX_JSON_BYTES = 16 * 2**20
+
+_TOKEN_BYTES = 8
+_TEMPORARY = re.compile(rf".+\.[0-9a-f]{{{2 * _TOKEN_BYTES}}}{re.escape(TEMPORARY_SUFFIX)}")
 
 
 def write_whole(path: Path, data: bytes) -> None:
@@ -32,15 +36,18 @@ def write_whole(path: Path, data: bytes) -> None:
 def whole_file(path: Path) -> Iterator[BinaryIO]:
     """Open a file that appears under its name only when the block ends without an error.
 
-    For content too large to hold in memory; else `write_whole`.
+    For content too large to hold in memory; else `write_whole`. Several writers of one path do not
+    meet: the last one to end has it. One that is killed leaves `NAME.<16 hex digits>.tmp`; see
+    `remove_temporaries`.
 
     Raises:
         OutputError: If the disk is full or the folder cannot be written; no partial file stays.
     """
-    temporary = path.with_name(path.name + TEMPORARY_SUFFIX)
+    token = os.urandom(_TOKEN_BYTES).hex()
+    temporary = path.with_name(f"{path.name}.{token}{TEMPORARY_SUFFIX}")
     with reported(path):
         try:
-            with temporary.open("wb") as file:
+            with temporary.open("xb") as file:
                 yield file
                 file.flush()
                 os.fsync(file.fileno())
@@ -49,6 +56,18 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
             temporary.unlink(missing_ok=True)
             raise
         sync_folder(path.parent)
+
+
+def remove_temporaries(folder: Path) -> None:
+    """Remove what killed writers left in `folder` itself, which has no live one.
+
+    Raises:
+        OutputError: If one cannot be removed.
+    """
+    with reported(folder):
+        for path in folder.iterdir():
+            if _TEMPORARY.fullmatch(path.name):
+                path.unlink(missing_ok=True)
 
 
 def sync_folder(folder: Path) -> None:
@@ -125,18 +144,27 @@ def parse_json(text: str, where: str) -> Any:
         raise DataError(f"{printable(where, 200)} is not valid JSON: {cause}") from None
 
 
+def check_plain(root: object, relative: str) -> tuple[str, ...]:
+    """The parts of a path below `root`, of which none leads elsewhere.
+
+    Raises:
+        DataError: If the path is not plain and relative.
+    """
+    parts = PurePosixPath(relative).parts
+    plain = isinstance(relative, str) and parts and "/".join(parts) == relative
+    if not plain or any(p in ("..", ".", "/") or "\\" in p or "\0" in p for p in parts):
+        raise DataError(f"{printable(root, 200)}: {printable(relative)!r} is not a plain path")
+    return parts
+
+
 def file_inside(root: Path, relative: str) -> Path:
     """The regular file that `relative` names below `root`; links and ways out are refused.
 
     Raises:
         DataError: If the path is not plain and relative, or no regular file is there.
     """
-    parts = PurePosixPath(relative).parts
-    plain = isinstance(relative, str) and parts and "/".join(parts) == relative
-    if not plain or any(p in ("..", ".", "/") or "\\" in p or "\0" in p for p in parts):
-        raise DataError(f"{printable(root, 200)}: {printable(relative)!r} is not a plain path")
     path = root
-    for part in parts:
+    for part in check_plain(root, relative):
         path = path / part
         try:
             mode = path.lstat().st_mode

@@ -1,4 +1,9 @@
-"""One process per output: a lock that the system frees when its holder dies."""
+"""One process per output: a lock that the system frees when its holder dies.
+
+It is `flock`. Linux sends it to the server of an NFS mount (v3 with lockd, v4), so that machines
+exclude each other there, unless it is mounted with nolock or local_lock; on Lustre it needs the
+mount option flock.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +12,20 @@ import json
 import os
 import socket
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from weather_aug import _files
 from weather_aug.errors import ConflictError, printable
 
+# Whoever looks for the name of a holder has the lock for a moment; that is waited for.
+_ATTEMPTS = 3
+_MOMENT_S = 0.02
+
 
 @contextmanager
-def exclusive(path: Path, busy: str) -> Iterator[None]:
+def exclusive(path: Path, busy: str, sharers: Iterable[Path] = ()) -> Iterator[None]:
     """Hold the lock file `path` alone, or refuse at once.
 
     The caller removes the file within the block if nothing shall stay of it. A file that stayed
@@ -25,14 +34,34 @@ def exclusive(path: Path, busy: str) -> Iterator[None]:
     Args:
         path: Lock file; its folder is made.
         busy: What is said of a lock that is held, before " by process … on …".
+        sharers: Lock files of which those that share `path` hold one each, to name one of them.
 
     Raises:
         ConflictError: If another process, or another thread of this one, holds it.
         OutputError: If the file cannot be written.
     """
-    descriptor = _acquired(path, busy)
-    try:
+    with _held(path, fcntl.LOCK_EX, busy, sharers) as descriptor:
+        with _files.reported(path):
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, _own_name(), 0)
         yield
+
+
+@contextmanager
+def shared(path: Path, busy: str) -> Iterator[None]:
+    """Hold the lock file `path` with others that share it; see `exclusive`.
+
+    The file does not name those that share it, and they must not remove it.
+    """
+    with _held(path, fcntl.LOCK_SH, busy):
+        yield
+
+
+@contextmanager
+def _held(path: Path, mode: int, busy: str, sharers: Iterable[Path] = ()) -> Iterator[int]:
+    descriptor = _acquired(path, mode, busy, sharers)
+    try:
+        yield descriptor
     finally:
         # Closing is not enough if this process was forked meanwhile: the child has the lock too.
         fcntl.flock(descriptor, fcntl.LOCK_UN)
@@ -48,7 +77,7 @@ def try_lock(descriptor: int, mode: int) -> bool:
     return True
 
 
-def _acquired(path: Path, busy: str) -> int:
+def _acquired(path: Path, mode: int, busy: str, sharers: Iterable[Path]) -> int:
     """A descriptor that holds the lock."""
     with _files.reported(path):
         while True:
@@ -57,18 +86,37 @@ def _acquired(path: Path, busy: str) -> int:
                 descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
             except FileNotFoundError:
                 continue
-            if not try_lock(descriptor, fcntl.LOCK_EX):
-                os.close(descriptor)
-                raise ConflictError(
-                    f"{busy} by {_holder_of(path)}; wait for it, or choose another folder"
-                )
-            if _is_still(path, descriptor):
-                break
-            # The last holder finished and removed the file between our open and our lock.
-            os.close(descriptor)
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, _own_name(), 0)
-    return descriptor
+            with ExitStack() as opened:
+                opened.callback(os.close, descriptor)
+                if not _lock_soon(descriptor, mode):
+                    holder = _holder_of(next(filter(_is_held, sharers), path))
+                    raise ConflictError(
+                        f"{busy} by {holder}; wait for it, or choose another folder"
+                    )
+                # Else the last holder removed the file between our open and our lock.
+                if _is_still(path, descriptor):
+                    opened.pop_all()
+                    return descriptor
+
+
+def _lock_soon(descriptor: int, mode: int) -> bool:
+    for attempt in range(_ATTEMPTS):
+        if attempt:
+            time.sleep(_MOMENT_S)
+        if try_lock(descriptor, mode):
+            return True
+    return False
+
+
+def _is_held(path: Path) -> bool:
+    try:
+        descriptor = os.open(path, os.O_RDWR)
+    except OSError:
+        return False
+    try:
+        return not try_lock(descriptor, fcntl.LOCK_SH)
+    finally:
+        os.close(descriptor)
 
 
 def _is_still(path: Path, descriptor: int) -> bool:

@@ -67,6 +67,7 @@ def open_checkout(path: Path, role: str) -> Checkout:
                 f"{checkout.name.upper()}, at its newest commit"
             )
     _check_keys(checkout.configs / "_base_" / DATASET)
+    _check_start(checkout.root / "run_experiments.py")
     return checkout
 
 
@@ -95,6 +96,15 @@ def _check_keys(path: Path) -> None:
                 f"{path} has no data.train.{role}.{sorted(missing)[0]}, which this config "
                 "overrides; take an unmodified checkout"
             )
+
+
+def _check_start(path: Path) -> None:
+    """MIC's first commit could not start a config: a dict has no pretty_text (lhoyer/MIC#2)."""
+    if "write(child_cfg.pretty_text)" in path.read_text(encoding="utf-8"):
+        raise Refused(
+            f"{path} is older than the authors' fix of its option --config; "
+            f"run `git -C {path.parent} pull`"
+        )
 
 
 def keywords(path: Path) -> dict[str, Any]:

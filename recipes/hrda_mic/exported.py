@@ -190,6 +190,7 @@ def _check_samples(
                 )
             if _checked_png(root / label, label_bytes, GREY) != size:
                 raise Refused(f"{image} in {root} and its label differ in size; export again")
+    _check_scan(root / reader.img_dir)
     found = sum(1 for _ in scanned(root / reader.img_dir, reader.img_suffix))
     if found != len(image_by_name):
         raise Refused(
@@ -198,6 +199,19 @@ def _check_samples(
             "the export"
         )
     return sizes
+
+
+def _check_scan(folder: Path) -> None:
+    """What is hidden, or a link that leads nowhere, mmcv 1.3.7 takes for a folder, and stops."""
+    for below, _, names in os.walk(str(folder), followlinks=True):
+        for name in names:
+            path = Path(below) / name
+            if name.startswith("."):
+                raise Refused(f"{path} is a hidden file, at which the loaders stop; remove it")
+            if not path.is_file():
+                raise Refused(
+                    f"{path} is a link that leads nowhere, at which the loaders stop; remove it"
+                )
 
 
 def scanned(folder: Path, suffix: str) -> Iterator[str]:

@@ -11,10 +11,23 @@ from pathlib import Path
 from typing import Any
 
 from checkouts import Checkout
-from exported import Exported, Size
+from exported import MIN_PIXELS, Exported, Size
 
 LINE = 88
+BATCH, ITERATIONS = 2, 40000
+DRAWN = BATCH * ITERATIONS
+"""Samples that a training draws. An epoch must not be shorter: its worker starts each with one seed
+and draws the same classes, files and crops again (torch < 1.8 keeps no worker alive)."""
+
 CROP_PX = 1024
+BESIDE = {"source": 1600, "target": 2975}
+"""Pictures of the other side, by the export's role: ACDC's of train, Cityscapes' of train."""
+
+BYTES_PER_PAIR = 40
+"""Of an epoch's order, a list of integers in CPython; measured."""
+
+LARGE_ORDER_GB = 4
+
 SCALE_PX = {"source": Size(2048, 1024), "target": Size(1920, 1080)}
 """Longest long and short side that pictures are resized to, keeping their aspect."""
 
@@ -28,14 +41,15 @@ def settings(checkout: Checkout, role: str, exported: Exported, seed: int) -> di
         "img_dir": reader.img_dir,
         "ann_dir": reader.ann_dir,
     }
-    train: dict[str, Any] = {
-        "source" if role == "source-only" else role: place,
-        "rare_class_sampling": {"min_pixels": 3000, "class_temp": 0.01, "min_crop_ratio": 2.0},
-    }
+    sampling = {"min_pixels": MIN_PIXELS, "class_temp": 0.01, "min_crop_ratio": 2.0}
+    train: dict[str, Any] = {role: place, "rare_class_sampling": sampling}
     if role == "source-only":
-        train["type"] = "DGDataset"
+        place["pipeline"] = _SOURCE_PIPELINE
+        alone = {"type": "DGDataset", "source": place, "rare_class_sampling": sampling}
+        times = -(-DRAWN // exported.samples)
+        train = {"_delete_": True, "type": "RepeatDataset", "times": times, "dataset": alone}
     values: dict[str, Any] = {
-        "data": {"samples_per_gpu": 2, "workers_per_gpu": 1, "train": train},
+        "data": {"samples_per_gpu": BATCH, "workers_per_gpu": 1, "train": train},
         "model": _MODEL,
     }
     if checkout.name == "mic":
@@ -78,9 +92,30 @@ def notes(exported: Exported, role: str) -> list[str]:
     if kind == "source" and exported.dropped:
         found.append(
             f"train ids {', '.join(map(str, exported.dropped))} occur, but never with more than "
-            "3000 pixels in one picture: they are learnt, not sampled"
+            f"{MIN_PIXELS} pixels in one picture: they are learnt, not sampled"
         )
-    return found
+    return found + pair_notes(exported.samples, role)
+
+
+def pair_notes(samples: int, role: str) -> list[str]:
+    """Of an epoch, every pair of a source and a target in an order that is kept in memory."""
+    if role not in BESIDE:
+        return []
+    beside = BESIDE[role]
+    pairs = samples * beside
+    if pairs < DRAWN:
+        return [
+            f"{samples} samples make {pairs} pairs with {beside} pictures; after {pairs // BATCH} "
+            "iterations the loader draws the same classes, files and crops again; "
+            f"export {-(-DRAWN // beside)} or more"
+        ]
+    gb = pairs * BYTES_PER_PAIR / 1e9
+    if gb > LARGE_ORDER_GB:
+        return [
+            f"the order of {samples} x {beside} pairs takes {gb:.0f} GB of memory; "
+            "export fewer if that is too much"
+        ]
+    return []
 
 
 def resized(size: Size, limits: Size) -> Size:
@@ -90,19 +125,37 @@ def resized(size: Size, limits: Size) -> Size:
 
 
 def _literal(value: Any, indent: int = 0) -> str:
-    """A value as Python writes it, one item a line where it is long."""
-    flat = repr(value)
+    """A value as Python writes it in ASCII, one item a line where it is long."""
+    flat = ascii(value)
     if not isinstance(value, (dict, list)) or indent + len(flat) <= LINE:
         return flat
     inside = indent + 4
     if isinstance(value, dict):
-        items = [f"{key!r}: {_literal(one, inside)}" for key, one in value.items()]
+        items = [f"{key!a}: {_literal(one, inside)}" for key, one in value.items()]
     else:
         items = [_literal(one, inside) for one in value]
     opening, closing = "{}" if isinstance(value, dict) else "[]"
     lines = "".join(f"{' ' * inside}{item},\n" for item in items)
     return f"{opening}\n{lines}{' ' * indent}{closing}"
 
+
+_SOURCE_PIPELINE = [
+    {"type": "LoadImageFromFile"},
+    {"type": "LoadAnnotations"},
+    {"type": "Resize", "img_scale": tuple(SCALE_PX["source"])},
+    {"type": "RandomCrop", "crop_size": (CROP_PX, CROP_PX), "cat_max_ratio": 0.75},
+    {"type": "RandomFlip", "prob": 0.5},
+    {
+        "type": "Normalize",
+        "mean": [123.675, 116.28, 103.53],
+        "std": [58.395, 57.12, 57.375],
+        "to_rgb": True,
+    },
+    {"type": "Pad", "size": (CROP_PX, CROP_PX), "pad_val": 0, "seg_pad_val": 255},
+    {"type": "DefaultFormatBundle"},
+    {"type": "Collect", "keys": ["img", "gt_semantic_seg"]},
+]
+"""Of the authors' Cityscapes, which a data set that is repeated cannot inherit."""
 
 _MODEL = {
     "type": "HRDAEncoderDecoder",
@@ -152,7 +205,7 @@ _SCHEDULE = {
             }
         },
     },
-    "runner": {"type": "IterBasedRunner", "max_iters": 40000},
-    "checkpoint_config": {"by_epoch": False, "interval": 40000, "max_keep_ckpts": 1},
+    "runner": {"type": "IterBasedRunner", "max_iters": ITERATIONS},
+    "checkpoint_config": {"by_epoch": False, "interval": ITERATIONS, "max_keep_ckpts": 1},
     "evaluation": {"interval": 4000, "metric": "mIoU"},
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from pathlib import Path
 from typing import Any
 
 from weather_aug.errors import OutputError
@@ -38,6 +39,27 @@ def die_after_writing_once(plan: Any, target: Any, pipe: Any) -> None:
         return lines
 
     worker.write_unit = deadly
+    worker.work(plan, target, pipe)
+
+
+def half_write_once(mark: Any) -> None:
+    """Let this process be killed in the middle of its next file, unless `mark` stands."""
+    sync = os.fsync
+
+    def deadly(descriptor: int) -> None:
+        path = str(Path(f"/proc/self/fd/{descriptor}").readlink())
+        if path.endswith(".tmp") and not mark.exists():
+            os.ftruncate(descriptor, 100)
+            mark.write_text(path)
+            os.kill(os.getpid(), signal.SIGKILL)
+        sync(descriptor)
+
+    os.fsync = deadly  # type: ignore[assignment]
+
+
+def die_while_writing_once(plan: Any, target: Any, pipe: Any) -> None:
+    """Be killed while a file is half written, the first time."""
+    half_write_once(target.state.parent / "died")
     worker.work(plan, target, pipe)
 
 

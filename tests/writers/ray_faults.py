@@ -6,7 +6,7 @@ import os
 import signal
 import time
 
-from export_faults import DEADLY_UNIT
+from export_faults import DEADLY_UNIT, half_write_once
 
 from weather_aug.errors import OutputError
 from weather_aug.writers.ray_engine import Answer, Renderer
@@ -23,6 +23,14 @@ class DiesOnce(Renderer):
             mark.touch()
             os.kill(os.getpid(), signal.SIGKILL)
         return answer
+
+
+class DiesWhileWriting(Renderer):
+    """Is killed while a file is half written, the first time."""
+
+    def write(self, unit: int) -> Answer:
+        half_write_once(self._target.state.parent / "died")
+        return super().write(unit)
 
 
 class DiesAlways(Renderer):
@@ -74,4 +82,12 @@ class Slow(Renderer):
 
     def write(self, unit: int) -> Answer:
         time.sleep(0.5)
+        return super().write(unit)
+
+
+class Steady(Renderer):
+    """Takes as long as a larger picture would, so that a run outlives who kills its members."""
+
+    def write(self, unit: int) -> Answer:
+        time.sleep(0.02)
         return super().write(unit)

@@ -13,9 +13,11 @@ from tiny_export import TinyClip
 from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.taxonomy import TRAIN_ID
+from weather_aug.writers import export as exporting
+from weather_aug.writers.choices import FromPolicy
 from weather_aug.writers.cityscapes import ClassStats
 from weather_aug.writers.export import export
-from weather_aug.writers.plan import plan_export
+from weather_aug.writers.plan import ExportPlan, plan_export
 
 NAMES = ("sample_class_stats.json", "sample_class_stats_dict.json", "samples_with_class.json")
 
@@ -46,7 +48,7 @@ def test_a_class_needs_one_file_with_more_than_3000_pixels(tmp_path: Path) -> No
     stats.add(1, {"0": 12, "5": 3000})
     assert stats.kept == (0,)
     assert stats.dropped == (5, 7)
-    stats.write(tmp_path, lambda index: f"gtFine/train/s/{index}.png")
+    stats.write(tmp_path, lambda: [f"gtFine/train/s/{index}.png" for index in range(3)])
     rows, by_file, by_class = read(tmp_path)
     assert rows == [
         {"0": 3001, "file": "gtFine/train/s/0.png"},
@@ -61,7 +63,7 @@ def test_a_class_needs_one_file_with_more_than_3000_pixels(tmp_path: Path) -> No
 def test_samples_without_a_label_are_left_out(tmp_path: Path) -> None:
     stats = ClassStats(2)
     stats.add(1, {"4": 5000})
-    stats.write(tmp_path, lambda index: "b.png" if index else None)
+    stats.write(tmp_path, lambda: [None, "b.png"])
     assert read(tmp_path)[0] == [{"4": 5000, "file": "b.png"}]
 
 
@@ -84,6 +86,26 @@ def test_the_statistics_of_an_export_count_its_labels(tmp_path: Path) -> None:
     assert [row[str(TRAIN_ID["sky"])] for row in read(tmp_path / "out")[0]] == sky
 
 
+def test_finishing_plans_nothing_anew(
+    plan: ExportPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An item's weather is drawn in 80 us: for each row of each file that was minutes."""
+    finish, asked = exporting.finish, []
+    item = FromPolicy.item
+
+    def watched(*arguments: Any, **options: Any) -> Any:
+        with monkeypatch.context() as patch:
+            patch.setattr(FromPolicy, "item", lambda *a: asked.append(a[1]) or item(*a))
+            return finish(*arguments, **options)
+
+    monkeypatch.setattr(exporting, "finish", watched)
+    export(plan, tmp_path / "out")
+    assert asked == []
+    rows, by_file, _ = read(tmp_path / "out")
+    paths = [plan.paths(index)["label"] for index in range(plan.count)]
+    assert [row["file"] for row in rows] == paths == list(by_file)
+
+
 def test_an_export_without_labels_has_no_statistics(tmp_path: Path) -> None:
     scene = WeatherScene.build(TinyClip(labelled=False), tmp_path / "scene")
     plan = plan_export([scene], WeatherPolicy(), count=3, seed=0)
@@ -100,5 +122,5 @@ def test_an_export_without_labels_has_no_statistics(tmp_path: Path) -> None:
 def test_counts_of_the_largest_picture_fit(tmp_path: Path, pixels: int) -> None:
     stats = ClassStats(1)
     stats.add(0, {"18": pixels})
-    stats.write(tmp_path, lambda index: "a.png")
+    stats.write(tmp_path, lambda: ["a.png"])
     assert read(tmp_path)[1] == {"a.png": {"18": pixels} if pixels else {}}

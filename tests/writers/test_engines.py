@@ -13,9 +13,9 @@ import export_faults
 import pytest
 from tiny_export import tree_of
 
+from weather_aug import _files
 from weather_aug.errors import IntegrityError, OutputError, WeatherAugError
 from weather_aug.writers import engines
-from weather_aug.writers import export as exporter
 from weather_aug.writers.export import export
 from weather_aug.writers.plan import ExportPlan
 
@@ -28,29 +28,6 @@ def out(tmp_path: Path) -> Path:
 def committed(out: Path) -> set[int]:
     lines = (out / ".export" / "journal").read_text().splitlines()[1:]
     return {json.loads(line.partition(" ")[2])["item"] for line in lines}
-
-
-def test_inline_gives_the_same_tree_again(
-    plan: ExportPlan, out: Path, expected_tree: dict[str, str]
-) -> None:
-    export(plan, out, workers=0)
-    assert tree_of(out) == expected_tree
-
-
-@pytest.mark.parametrize("workers", [1, 2, 3])
-def test_any_number_of_processes_gives_the_same_tree(
-    plan: ExportPlan,
-    out: Path,
-    workers: int,
-    expected_tree: dict[str, str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(
-        exporter, "run_inline", lambda *args: engines.run_processes(*args, workers=1)
-    )
-    assert export(plan, out, workers=workers).rendered == 10
-    assert tree_of(out) == expected_tree
-    assert multiprocessing.active_children() == []
 
 
 def test_a_killed_worker_is_replaced_and_its_item_made(
@@ -75,6 +52,16 @@ def test_a_worker_that_dies_after_writing_costs_nothing(
     monkeypatch.setattr(engines, "work", export_faults.die_after_writing_once)
     export(plan, out, workers=2)
     assert (out.parent / "died").exists()
+    assert tree_of(out) == expected_tree
+
+
+def test_what_a_dead_worker_half_wrote_goes_with_the_run(
+    plan: ExportPlan, out: Path, expected_tree: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engines, "work", export_faults.die_while_writing_once)
+    export(plan, out, workers=2)
+    left = (out.parent / "died").read_text()
+    assert left.endswith(_files.TEMPORARY_SUFFIX)
     assert tree_of(out) == expected_tree
 
 

@@ -70,25 +70,25 @@ def test_an_estimate_of_a_plan_writes_nothing(scene: WeatherScene, tmp_path: Pat
 
 def test_what_is_there_already_is_counted(plan: ExportPlan, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    assert committed(out) == 0
+    assert committed(out, plan) == 0
     counts: list[int] = []
 
     def stop(entry: dict[str, object]) -> None:
-        counts.append(committed(out))
+        counts.append(committed(out, plan))
         if len(counts) == 4:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         export(plan, out, on_sample=stop)
     assert counts == [1, 2, 3, 4]
-    assert committed(out) == 4
+    assert committed(out, plan) == 4
     with (out / JOURNAL).open("ab") as file:
         file.write(b"a line cut sho")
-    assert committed(out) == 4
+    assert committed(out, plan) == 4
     export(plan, out)
-    assert committed(out) == 10
+    assert committed(out, plan) == 10
     (out / CONTENTS).write_text("{}")
-    assert committed(out) == 0
+    assert committed(out, plan) == 0
 
 
 @given(st.integers(1, 10**8), st.integers(1, 64), st.binary(min_size=8, max_size=8))

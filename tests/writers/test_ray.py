@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import faulthandler
 import json
+import logging
 import os
 import signal
 import socket
@@ -18,6 +19,7 @@ import pytest
 from export_faults import DEADLY_UNIT
 from tiny_export import tree_of
 
+from weather_aug import _files
 from weather_aug.errors import (
     ArgumentError,
     ConflictError,
@@ -103,6 +105,7 @@ def process_state() -> dict[str, Any]:
         "sigint": signal.getsignal(signal.SIGINT),
         "excepthook": sys.excepthook,
         "faulthandler": faulthandler.is_enabled(),
+        "logging": logging.getLogger("ray").level,
     }
 
 
@@ -184,6 +187,16 @@ def test_an_actor_that_dies_after_writing_costs_nothing(
     faults("DiesOnce")
     export(plan, out, engine="ray", workers=2)
     assert (out.parent / "died").exists()
+    assert tree_of(out) == expected_tree
+
+
+@pytest.mark.slow
+def test_what_a_dead_actor_half_wrote_goes_with_the_run(
+    standing: Any, plan: ExportPlan, out: Path, faults: Any, expected_tree: dict[str, str]
+) -> None:
+    faults("DiesWhileWriting")
+    export(plan, out, engine="ray", workers=2)
+    assert (out.parent / "died").read_text().endswith(_files.TEMPORARY_SUFFIX)
     assert tree_of(out) == expected_tree
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_crash import assert_committed_verifies, exit_status_of_fork
+from planted_calls import kill_at_each_call
 from tiny_export import POLICY, tree_of
 
 from weather_aug import _files
@@ -294,24 +294,13 @@ def small_tree(small: ExportPlan, tmp_path_factory: pytest.TempPathFactory) -> d
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 @pytest.mark.parametrize("finished", [False, True])
-@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.slow), 4])
+@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.slow), 5])
 def test_killed_at_any_call_it_can_be_continued(
     small: ExportPlan, small_tree: dict[str, str], tmp_path: Path, finished: bool, every: int
 ) -> None:
     """Once from nothing, once while a damaged tar is being repaired."""
-    call, status = 1 - every, 1
-    while status != 0:
-        call += every
-        out = tmp_path / str(call)
-        if finished:
-            export(small, out)
-            (out / TARS[0]).unlink()
-        status = exit_status_of_fork(small, out, call)
-        if not finished:
-            assert_committed_verifies(out)
-        export(small, out)
-        assert tree_of(out) == small_tree
-    assert call > 25
+    damaged = TARS[0] if finished else None
+    assert kill_at_each_call(small, small_tree, tmp_path, every=every, damaged=damaged) > 30 / every
 
 
 def test_leftovers_of_a_killed_run_are_removed(plan: ExportPlan, whole: Path, out: Path) -> None:

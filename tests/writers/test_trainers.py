@@ -143,6 +143,22 @@ def test_the_order_of_the_scan_does_not_matter(
         assert found == sorted(found, reverse=reverse)
 
 
+def test_what_is_no_plain_file_ends_a_scan(tmp_path: Path) -> None:
+    """As mmcv 1.3.7 does it; read there, and run in `test_real_checkout`."""
+    (tmp_path / "clip").mkdir()
+    (tmp_path / "clip" / "a_leftImg8bit.png").write_text("")
+    (tmp_path / "again").symlink_to("clip")
+    found = sorted(scan(tmp_path, "_leftImg8bit.png"))
+    assert found == ["again/a_leftImg8bit.png", "clip/a_leftImg8bit.png"]
+    (tmp_path / "clip" / ".DS_Store").write_text("")
+    with pytest.raises(NotADirectoryError):
+        list(scan(tmp_path, "_leftImg8bit.png"))
+    (tmp_path / "clip" / ".DS_Store").unlink()
+    (tmp_path / "b_leftImg8bit.png").symlink_to("nowhere")
+    with pytest.raises(FileNotFoundError):
+        list(scan(tmp_path, "_leftImg8bit.png"))
+
+
 @pytest.mark.parametrize("layout", existing(TARGETS))
 def test_a_target_needs_no_labels(
     exported: Callable[[str], Path], tmp_path: Path, layout: str

@@ -7,9 +7,13 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import fsspec
 import pytest
+from fsspec.implementations.memory import MemoryFileSystem
 
+from weather_aug.errors import OutputError
 from weather_aug.writers import layout
 from weather_aug.writers.export import export
 from weather_aug.writers.plan import ExportPlan
@@ -45,6 +49,46 @@ def test_every_file_of_the_export_is_watched(out: Path) -> None:
         assert verify_export(out), f"without {path} it passed"
         path.write_bytes(data)
     assert verify_export(out) == []
+
+
+@pytest.mark.parametrize("protocol", ["memory", "file"])
+def test_every_file_at_a_url_is_watched(out: Path, protocol: str) -> None:
+    url = f"{protocol}://{out}"
+    fs = fsspec.filesystem(protocol)
+    if protocol == "memory":
+        fs.put(str(out), url, recursive=True)
+    assert verify_export(url) == []
+    files = [path for path in fs.find(str(out)) if not path.endswith(".png")]
+    files += [path for path in fs.find(str(out)) if path.endswith(".png")][:2]
+    for path in files:
+        data = fs.cat_file(path)
+        flipped = bytes([data[0] ^ 1]) + data[1:]
+        for damage in (b"", data[:-1], data + b" ", flipped):
+            fs.pipe_file(path, damage)
+            assert verify_export(url), f"{path} with {len(damage)} bytes passed"
+        fs.rm_file(path)
+        assert verify_export(url), f"without {path} it passed"
+        fs.pipe_file(path, data)
+    fs.pipe_file(f"{out}/more.txt", b"x")
+    assert verify_export(url) == ["more.txt is not part of the export"]
+
+
+def test_at_a_url_paths_that_lead_outside_are_not_followed(out: Path) -> None:
+    manifest = out / "manifest.jsonl"
+    manifest.write_text(manifest.read_text().replace("leftImg8bit/train", "../../etc", 1))
+    assert any("not a plain path" in problem for problem in verify_export(f"file://{out}"))
+
+
+def test_a_url_that_does_not_answer_is_no_damage(out: Path) -> None:
+    class Silent(MemoryFileSystem):
+        protocol = ("silent",)
+
+        def info(self, path: str, **_: Any) -> Any:
+            raise RuntimeError("no route to host")
+
+    fsspec.register_implementation("silent", Silent, clobber=True)
+    with pytest.raises(OutputError, match=r"cannot read silent://host/x/export\.json: .*no route"):
+        verify_export("silent://me:secret@host/x")
 
 
 def test_extra_and_swapped_files_are_reported_and_kept(plan: ExportPlan, out: Path) -> None:
@@ -109,7 +153,7 @@ def test_it_needs_neither_torch_nor_a_renderer(out: Path) -> None:
         "from pathlib import Path\n"
         "from weather_aug.writers.verify import verify_export\n"
         f"assert verify_export(Path({str(out)!r})) == []\n"
-        "heavy = {'torch', 'numba', 'cv2', 'numpy'} & set(sys.modules)\n"
+        "heavy = {'torch', 'numba', 'cv2', 'numpy', 'fsspec'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
+import fsspec
 import numpy as np
 import pytest
 from tiny_export import TinyClip
@@ -16,6 +18,7 @@ from weather_aug.taxonomy import CLASSES, coloured
 from weather_aug.writers.export import export
 from weather_aug.writers.manifest import manifest_lines
 from weather_aug.writers.plan import ExportPlan, plan_grid
+from weather_aug.writers.source import source_of
 from weather_aug.writers.written import read_part, read_written, written_sheet
 
 
@@ -30,6 +33,42 @@ def tars(scene: WeatherScene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same street as tars."""
     plan = plan_grid([scene], ["clear", "fog=0.9"], layout="webdataset")
     return export(plan, tmp_path_factory.mktemp("tars") / "out").out
+
+
+def test_a_url_is_read_as_a_folder_is(out: Path, tars: Path) -> None:
+    memory = fsspec.filesystem("memory")
+    for folder in (out, tars):
+        url = f"memory://written/{folder.parent.name}"
+        memory.put(str(folder), url, recursive=True)
+        local = read_written(folder)
+        for place in (url, f"file://{folder}", source_of(url)):
+            written = read_written(place)
+            assert written.shown == local.shown
+            assert np.array_equal(written.pixels, local.pixels)
+            sheet = written_sheet(place, written, tile_width=48)
+            assert np.array_equal(sheet, written_sheet(str(folder), local, tile_width=48))
+    memory.rm(f"{url}/{local.shown[0]['files']['tar']['path']}")
+    with pytest.raises(IntegrityError, match=r"memory://written/.*\.tar is missing"):
+        read_written(url)
+
+
+def test_of_a_tar_at_a_url_only_the_part_is_read(
+    tars: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory = fsspec.filesystem("memory")
+    memory.put(str(tars), "memory://written/ranges", recursive=True)
+    asked: list[int] = []
+    cat = type(memory).cat_file
+
+    def counting(self: Any, path: str, start: int | None = None, end: int | None = None) -> bytes:
+        data: bytes = cat(self, path, start, end)
+        asked.append(len(data))
+        return data
+
+    monkeypatch.setattr(type(memory), "cat_file", counting)
+    entry = json.loads(next(manifest_lines(tars)))
+    read_part("memory://written/ranges", entry, "label")
+    assert asked == [entry["members"]["label"]["size"]]
 
 
 def test_shares_are_those_of_the_labels_on_disk(out: Path) -> None:
@@ -118,5 +157,5 @@ def test_changed_bytes_are_noticed(plan: ExportPlan, tmp_path: Path) -> None:
     with pytest.raises(IntegrityError, match="has changed since it was written"):
         read_written(out)
     path.unlink()
-    with pytest.raises(IntegrityError, match="cannot be read"):
+    with pytest.raises(IntegrityError, match="is missing"):
         read_written(out)

@@ -87,14 +87,14 @@ def config_of(path: Path) -> dict[str, Any]:
 
 
 def merged_into(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """`_delete_` is taken out, and heeded, only where the base has the name."""
     made = dict(base)
     for key, value in over.items():
-        deletes = isinstance(value, dict) and value.get("_delete_", False)
-        if isinstance(value, dict) and key in base and not deletes:
-            assert isinstance(base[key], dict), f"mmcv merges no dict into {key}"
-            made[key] = merged_into(base[key], value)
-        elif isinstance(value, dict):
+        if not isinstance(value, dict) or key not in base:
+            made[key] = value
+        elif value.get("_delete_", False):
             made[key] = {k: v for k, v in value.items() if k != "_delete_"}
         else:
-            made[key] = value
+            assert isinstance(base[key], dict), f"mmcv merges no dict into {key}"
+            made[key] = merged_into(base[key], value)
     return made

@@ -3,7 +3,8 @@
 Convention:
     A data set class is tied to an image suffix and a label suffix. It lists its pictures by a scan
     of `img_dir`, of any depth, in whatever order the file system gives; a label is where the suffix
-    replaced in the picture's path leads, below `ann_dir`. Rare-class sampling (RCS) draws a class c
+    replaced in the picture's path leads, below `ann_dir`. What is hidden, or a link that leads
+    nowhere, ends a run there. Rare-class sampling (RCS) draws a class c
     with P(c) = softmax((1 - f_c) / T) of its share f_c of all pixels, then a file with more than
     `min_pixels` of it, then crops of that file until one shows enough of the class, at most eleven.
     It matches files by base name, but in the GTA class by path. Pictures are BGR, labels
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 UInt8 = NDArray[np.uint8]
+Window = tuple[slice, slice]
 IGNORE = 255
 CROP_TRIES = 10
 
@@ -58,16 +60,17 @@ class Sample(NamedTuple):
 
 
 def scan(folder: Path, suffix: str, below: str = "") -> Iterator[str]:
-    """Relative paths of the files with a suffix, of any depth, unsorted; hidden ones are skipped.
+    """Relative paths of the files with a suffix, of any depth, unsorted, as mmcv 1.3.7 scans.
 
     Raises:
-        FileNotFoundError: If there is no such folder.
+        FileNotFoundError: If there is no such folder, or a link leads nowhere.
+        NotADirectoryError: If a file is hidden: what is no plain file is taken for a folder.
     """
-    for entry in os.scandir(folder):
+    for entry in list(os.scandir(folder)):
         relative = f"{below}{entry.name}"
-        if entry.is_dir():
+        if entry.name.startswith(".") or not entry.is_file():
             yield from scan(Path(entry.path), suffix, f"{relative}/")
-        elif relative.endswith(suffix) and not entry.name.startswith("."):
+        elif relative.endswith(suffix):
             yield relative
 
 
@@ -119,28 +122,42 @@ class Pictures:
 
     def load(self, index: int, rng: np.random.Generator) -> Sample:
         """A picture and its label resized, cropped, perhaps flipped, and padded."""
+        resized = self.resized(index)
+        window = self._window(resized.image.shape[:2], resized.label, rng)
+        return self.cut(resized, window, bool(rng.random() < 0.5))
+
+    def resized(self, index: int) -> Sample:
+        """A picture and its label, fitted into the scale."""
         image, label = self.whole(index)
         image = fitted(image, self.sizes.scale, cv2.INTER_LINEAR)
         if label is not None:
             label = fitted(label, self.sizes.scale, cv2.INTER_NEAREST)
-        window = self._window(image.shape[:2], label, rng)
-        flip = slice(None, None, -1 if rng.random() < 0.5 else 1)
-        planes = (None if plane is None else plane[window][:, flip] for plane in (image, label))
-        image, label = next(planes), next(planes)
+        return Sample(image, label)
+
+    def cut(self, resized: Sample, window: Window, flip: bool) -> Sample:
+        """A window of a resized sample, perhaps flipped, and padded; black is before the mean."""
+        columns = slice(None, None, -1 if flip else 1)
+        image, label = resized
         crop = self.sizes.crop
         return Sample(
-            padded(image, crop, 0), None if label is None else padded(label, crop, IGNORE)
+            padded(image[window][:, columns], crop, 0),
+            None if label is None else padded(label[window][:, columns], crop, IGNORE),
         )
 
     def _window(
         self, shape: tuple[int, ...], label: UInt8 | None, rng: np.random.Generator
-    ) -> tuple[slice, slice]:
+    ) -> Window:
         for _ in range(CROP_TRIES + 1):
             starts = [int(rng.integers(max(side - self.sizes.crop, 0) + 1)) for side in shape]
-            window = tuple(slice(start, start + self.sizes.crop) for start in starts)
+            window = window_at(starts[0], starts[1], self.sizes.crop)
             if label is None or varied(label[window], self.sizes.cat_max_ratio):
                 break
         return window
+
+
+def window_at(top: int, left: int, side: int) -> Window:
+    """A square of a picture; it may reach beyond the right and the lower edge."""
+    return slice(top, top + side), slice(left, left + side)
 
 
 def fitted(plane: UInt8, scale: tuple[int, int], interpolation: int) -> UInt8:

@@ -6,10 +6,9 @@ import json
 import os
 import sys
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 from tyro.conf import Positional
@@ -17,19 +16,14 @@ from tyro.conf import Positional
 from weather_aug import __version__, _files
 from weather_aug.cli.build import Build
 from weather_aug.cli.export import Export
+from weather_aug.cli.inspect import Inspect
 from weather_aug.cli.merge import Merge
 from weather_aug.cli.pairs import ListPairs
 from weather_aug.cli.render import Render
 from weather_aug.cli.terminal import check_folder, complain, say, to_people
 from weather_aug.cli.train import TrainEditor
 from weather_aug.cli.view import View
-from weather_aug.errors import (
-    ArgumentError,
-    DataError,
-    IntegrityError,
-    WeatherAugError,
-    printable,
-)
+from weather_aug.errors import ArgumentError, WeatherAugError, printable
 from weather_aug.taxonomy import IGNORE
 
 DEMO_WIDTH_PX = (32, 4096)
@@ -82,24 +76,6 @@ class Sweep:
         sheet = draw(scene, key, seed=self.seed, tile_width=self.tile_width, options=options)
         write_png(self.out, sheet)
         say(str(self.out))
-
-
-@dataclass(frozen=True)
-class Inspect:
-    """Say what a scene or an export holds, and whether every byte is the one written."""
-
-    path: Positional[Path]
-    """Scene or export folder."""
-
-    def run(self) -> None:
-        """Print the contents, then verify; damage ends with exit code 4."""
-        problems, cure = _inspected(self.path)
-        for problem in problems:
-            say(problem)
-        if problems:
-            count = f"{len(problems)} problem{'s' if len(problems) > 1 else ''}"
-            raise IntegrityError(f"{printable(self.path, 200)} is not whole ({count}); {cure}")
-        say("every file is whole")
 
 
 @dataclass(frozen=True)
@@ -189,73 +165,6 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(130)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _inspected(path: Path) -> tuple[list[str], str]:
-    """What is wrong with a scene or an export, one sentence each, and the cure."""
-    from weather_aug.scene import store
-    from weather_aug.writers import layout
-    from weather_aug.writers.verify import verify_export
-
-    if (path / store.MANIFEST).is_file():
-        return _inspect_scene(path), "build the scene again"
-    if any((path / name).exists() for name in (layout.CONTENTS, layout.JOURNAL)):
-        return verify_export(path), _cure_of_export(path / layout.CONTENTS)
-    raise DataError(
-        f"{printable(path, 200)} is neither a scene (no {store.MANIFEST}) nor an export (no "
-        f"{layout.CONTENTS})"
-    )
-
-
-def _cure_of_export(contents: Path) -> str:
-    from weather_aug.writers import layout
-
-    try:
-        if contents.exists():
-            layout.read_contents(contents.parent)
-    except (DataError, IntegrityError, OSError):
-        # Nobody knows any more which job it was.
-        return "remove the folder and export again"
-    return "run the same export again with --verify to repair it"
-
-
-def _inspect_scene(path: Path) -> list[str]:
-    from weather_aug.scene.scene import WeatherScene
-
-    try:
-        scene = WeatherScene.load(path)
-    except (DataError, IntegrityError) as error:
-        if str(error).endswith("again"):
-            raise
-        raise type(error)(f"{error}; build the scene again") from None
-    manifest = scene.manifest
-    labelled = sum("label" in record.files for record in manifest.frames)
-    size_mib = sum(stored.size for stored in manifest.files.values()) / 2**20
-    say(f"scene {scene.name}, digest {scene.digest[:12]}, editor {manifest.editor}")
-    say(f"{len(scene.keys)} frames ({labelled} labelled) of {', '.join(scene.cameras)}")
-    if manifest.backgrounds is not None:
-        say(f"backgrounds: {', '.join(manifest.styles)}{_named(manifest.backgrounds.card)}")
-    if manifest.reconstruction is not None:
-        shapes, styles = manifest.reconstruction.shapes, manifest.reconstruction.styles
-        count = shapes["background_means_m"][0] + shapes["owners"][0]
-        say(f"{count} Gaussians, styles: {', '.join(styles) or 'none'}")
-    say(f"{len(manifest.files)} files, {size_mib:.1f} MiB")
-    return scene.damaged_files()
-
-
-def _named(card: Mapping[str, Any]) -> str:
-    """What an editor's card says in so many words, for people: texts and numbers, not lists."""
-    told = [
-        f"{printable(name)} {printable(_shortened(name, value))}"
-        for name, value in card.items()
-        if isinstance(value, str | int | float) and value != "" and name != "editor"
-    ]
-    return f" ({', '.join(told)})" if told else ""
-
-
-def _shortened(name: str, value: object) -> object:
-    is_digest = isinstance(value, str) and name.endswith(("digest", "sha256", "revision"))
-    return str(value)[:12] if is_digest else value
 
 
 def _state(recipe: str) -> str:

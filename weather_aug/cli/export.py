@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,17 +13,18 @@ from tyro.conf import Positional
 
 from weather_aug.cli.terminal import complain, say, to_people
 from weather_aug.cli.values import numbers_by_name
-from weather_aug.errors import ArgumentError, IntegrityError, OutputError
+from weather_aug.errors import ArgumentError, DataError, IntegrityError, OutputError, printable
 
 if TYPE_CHECKING:
     from weather_aug.scene.scene import WeatherScene
     from weather_aug.writers.balance import ClassBalance
     from weather_aug.writers.plan import ExportPlan
+    from weather_aug.writers.shards import Shard
 
 COUNT = 1000
 RARE_SHOWN = 5
 _OF_DRAWS = ("count", "types", "severity", "falling", "balance")
-_AGAINST = {"weather": _OF_DRAWS, "list": ("weather", *_OF_DRAWS, "seed")}
+_AGAINST = {"weather": _OF_DRAWS, "list": ("weather", *_OF_DRAWS, "seed"), "shard": ("verify",)}
 
 
 @dataclass(frozen=True)
@@ -30,13 +32,18 @@ class Export:
     """Write an offline data set; run again to continue.
 
     Says first what it will be, its size and how long it takes; ends with a contact sheet beside the
-    folder and the classes of what was written.
+    folder (of a url, in the working directory) and the classes of what was written.
     """
 
     scenes: Positional[tuple[Path, ...]]
     """Scene folders."""
-    out: Path
-    """Folder of the data set."""
+    out: str
+    """Folder of the data set, or a url that fsspec knows, such as s3://bucket/rainy; credentials
+    and other options of a url come from fsspec's configuration (files in ~/.config/fsspec,
+    variables FSSPEC_…) and from what its file system reads by itself."""
+    state: Path | None = None
+    """For a url, folder of lock, journal and root files, by which a second run continues;
+    .weather-aug-export in the working directory if not given."""
     count: int | None = None
     """Samples to write of weathers that are drawn; 1000 if not given."""
     types: tuple[str, ...] = ("clear=1", "rain=1", "snow=1", "fog=1")
@@ -71,6 +78,9 @@ class Export:
     """Who renders: processes of this machine, this process alone, or Ray."""
     address: str | None = None
     """Of a Ray cluster, which must see --out; without one Ray starts on this machine."""
+    shard: str | None = None
+    """Render a part only, "3/16" the third of sixteen, counted from 1 as array jobs are, beside
+    machines that render the others into the same --out; finish with the same command without it."""
     verify: bool = False
     """Compare every byte of what is there already, not only sizes, and repair what differs."""
     dry_run: bool = False
@@ -80,16 +90,17 @@ class Export:
 
     def run(self) -> None:
         """Say what will be written, export, and show what was."""
-        from weather_aug.writers.export import export
-        from weather_aug.writers.lock import check_output
+        from weather_aug.writers.export import export, export_target
+        from weather_aug.writers.source import source_of
 
         self._check()
+        shard = None if self.shard is None else parsed_shard(self.shard)
         plan = self.plan()
         if not self.dry_run:
-            # Before anything is measured for a folder that will be refused.
-            check_output(self.out, [scene.path for scene in plan.scenes])
+            # Before anything is measured for a place that will be refused.
+            export_target(plan, self.out, self.state)
         if not self.quiet or self.dry_run:
-            self._summarise(plan)
+            self._summarise(plan, shard)
         if self.dry_run:
             return
         report = export(
@@ -98,14 +109,26 @@ class Export:
             workers=self.workers,
             engine=self.engine,
             address=self.address,
+            shard=None if shard is None else (shard.number, shard.of),
+            state=self.state,
             progress=to_people() and not self.quiet,
             verify=self.verify,
         )
-        say(f"{report.samples} samples in {self.out}")
+        out = source_of(self.out)
+        if shard is None:
+            say(f"{report.samples} samples in {out}")
+        elif report.finished:
+            say(f"{out} is finished already, {report.samples} samples; {shard} has nothing to do")
+            return
+        else:
+            say(
+                f"{report.samples} samples of {shard} are committed in {out}; when all shards are "
+                "done, the same command without --shard finishes the export"
+            )
         unlabelled = report.samples - report.labelled
         if unlabelled and "label" in plan.parts:
             complain(f"warning: {unlabelled} of {report.samples} samples have no label")
-        if not self.quiet:
+        if shard is None and not self.quiet:
             self._show()
 
     def plan(self) -> ExportPlan:
@@ -155,9 +178,11 @@ class Export:
         if self.seeds != Export.seeds and not self.weather:
             raise ArgumentError("--seeds needs --weather; --count says how many samples are drawn")
 
-    def _summarise(self, plan: ExportPlan) -> None:
+    def _summarise(self, plan: ExportPlan, shard: Shard | None) -> None:
         from weather_aug.writers.choices import FromPolicy
         from weather_aug.writers.estimate import committed, estimate
+        from weather_aug.writers.export import state_of
+        from weather_aug.writers.shards import WHOLE
 
         frames = sum(len(scene.keys) for scene in plan.scenes)
         of = "scene" if len(plan.scenes) == 1 else "scenes"
@@ -170,33 +195,35 @@ class Export:
         if self.engine == "ray":
             engine = f"{self.workers} actors of Ray"
         say(f"layout   {plan.layout.name}, {plan.split}: {', '.join(plan.parts)}; by {engine}")
-        done = committed(self.out)
-        if done >= plan.count:
+        part = WHOLE if shard is None else shard
+        count = part.count(plan)
+        if shard is not None:
+            say(f"shard    {shard.number} of {shard.of}: {count} samples")
+        done = committed(state_of(self.out, self.state), plan, part)
+        if done == count:
             say("time     all samples are there already")
             return
         cost = estimate(plan)
         there = f"; {done} samples are there already" if done else ""
+        size = told_bytes(count * cost.bytes_per_sample)
+        say(f"size     about {size}, {told_bytes(cost.bytes_per_sample)} a sample")
         say(
-            f"size     about {told_bytes(cost.bytes)}, {told_bytes(cost.bytes_per_sample)} a sample"
-        )
-        say(
-            f"time     about {told_seconds(cost.seconds(self.workers, plan.count - done))}, "
+            f"time     about {told_seconds(cost.seconds(self.workers, count - done))}, "
             f"{cost.seconds_per_sample:.2g} s a sample ({cost.measured} measured){there}"
         )
 
     def _show(self) -> None:
-        """Classes and a contact sheet of what stands on disk."""
+        """Classes and a contact sheet of what was written."""
         from weather_aug.view.histogram import class_bars
         from weather_aug.view.sheet import write_png
         from weather_aug.writers.written import read_written, written_sheet
 
-        path = self.out.absolute()
-        sheet = path.with_name(f"{path.name}.png")
+        sheet = sheet_of(self.out)
         try:
             written = read_written(self.out)
             picture = written_sheet(self.out, written)
             write_png(sheet, picture)
-        except IntegrityError as error:
+        except (DataError, IntegrityError) as error:
             complain(f"warning: {error}; run the same export again with --verify to repair it")
             return
         except OutputError as error:
@@ -209,7 +236,32 @@ class Export:
             for line in class_bars(written.shares, colour=sys.stdout.isatty()):
                 say(line)
         say("look at")
-        say(str(self.out.with_name(sheet.name) if self.out.name else sheet))
+        say(str(sheet))
+
+
+def sheet_of(out: str) -> Path:
+    """Where the contact sheet goes: beside a folder; of a url, into the working directory."""
+    from weather_aug.writers.place import Place
+    from weather_aug.writers.source import is_url
+
+    if is_url(out):
+        return Path(f"{Place(out).name}.png")
+    path = Path(out) if Path(out).name else Path(out).absolute()
+    return path.with_name(f"{path.name}.png")
+
+
+def parsed_shard(text: str) -> Shard:
+    """The shard of a text "i/n".
+
+    Raises:
+        ArgumentError: If there is no such shard.
+    """
+    from weather_aug.writers.shards import Shard
+
+    numbers = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
+    if numbers is None:
+        raise ArgumentError(f"--shard takes i/n, such as 3/16, got {printable(text)!r}")
+    return Shard(int(numbers[1]), int(numbers[2]))
 
 
 def parsed_types(items: tuple[str, ...]) -> dict[str, float]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,9 @@ from weather_aug.clip.types import Frame
 from weather_aug.edit.ambience import Ambience
 from weather_aug.edit.physical.layers import Layers
 from weather_aug.errors import ArgumentError
+
+if TYPE_CHECKING:
+    from weather_aug.edit.diffusion.leakage import TrainedOn
 
 UInt8 = NDArray[np.uint8]
 
@@ -85,3 +88,11 @@ class BackgroundEditor(Protocol):
             ArgumentError: If the style is none of the editor's.
             DataError: If a picture cannot be edited.
         """
+
+
+@runtime_checkable
+class RecordedEditor(Protocol):
+    """What a `BackgroundEditor` may have besides: a record of the pictures it was trained on."""
+
+    def trained_on(self, style: str) -> TrainedOn | None:
+        """What its pictures of a style were learnt from; None where nobody recorded it."""

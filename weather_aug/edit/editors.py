@@ -39,6 +39,8 @@ _MEASURE = ("colour-transfer",)
 """Editors that look at the clip before they edit it."""
 EDITORS = (*_HOMES, "none")
 """Names of editors that store backgrounds; the physical editor needs none."""
+UNTRAINED = ("none", "snow-cover")
+"""Of them, those that learnt nothing from any picture."""
 
 
 class Unedited:

@@ -16,13 +16,19 @@ from weather_aug import _files
 from weather_aug._png import png_bytes
 from weather_aug.clip.types import Clip, Frame
 from weather_aug.edit.ambience import Ambience
-from weather_aug.edit.background import STYLES, BackgroundEditor, Moment
+from weather_aug.edit.background import STYLES, BackgroundEditor, Moment, RecordedEditor
+from weather_aug.edit.diffusion.leakage import TrainedOn
 from weather_aug.edit.editors import editor_of
 from weather_aug.edit.physical.layers import Layers
 from weather_aug.errors import ArgumentError, printable
 from weather_aug.scene import store
-from weather_aug.scene.backgrounds_record import BACKGROUNDS, MOST_CARD_BYTES, background_path
-from weather_aug.scene.journal import Round, make_all
+from weather_aug.scene.backgrounds_record import (
+    BACKGROUNDS,
+    MOST_CARD_BYTES,
+    TRAINED_ON,
+    background_path,
+)
+from weather_aug.scene.journal import Round, digest_record, make_all
 from weather_aug.scene.records import FrameRecord, Manifest
 from weather_aug.scene.styles import PHYSICAL
 
@@ -38,6 +44,8 @@ class Editing(NamedTuple):
     styles: tuple[str, ...]
     card: dict[str, Any]
     """Of the editor, as JSON reads it back."""
+    records: dict[str, TrainedOn]
+    """What the editor was trained on, by style; only of styles of which it can tell."""
 
 
 def editing_of(
@@ -54,7 +62,7 @@ def editing_of(
     Raises:
         ArgumentError: If there is no such editor, it cannot edit to a weather, or is none; if
             options are given that it does not take.
-        DataError: If its weights cannot be read.
+        DataError: If its weights, or a record of what it was trained on, cannot be read.
         MissingExtraError: If a package that it needs is not installed.
     """
     if isinstance(editor, str) and editor != PHYSICAL:
@@ -81,7 +89,8 @@ def editing_of(
             f"editor {editor.name} has the styles {printable(known)}; they must be of "
             f"{', '.join(STYLES)}, each once"
         )
-    return Editing(editor, _styles_wanted(editor.name, known, weathers), _card_of(editor))
+    styles = _styles_wanted(editor.name, known, weathers)
+    return Editing(editor, styles, _card_of(editor), _records_of(editor, styles))
 
 
 def _styles_wanted(
@@ -119,6 +128,19 @@ def _card_of(editor: BackgroundEditor) -> dict[str, Any]:
         )
     card: dict[str, Any] = json.loads(text)
     return card
+
+
+def _records_of(editor: BackgroundEditor, styles: tuple[str, ...]) -> dict[str, TrainedOn]:
+    if not isinstance(editor, RecordedEditor):
+        return {}
+    found = {style: editor.trained_on(style) for style in styles}
+    for style, record in found.items():
+        if not isinstance(record, TrainedOn | None):
+            raise ArgumentError(
+                f"editor {editor.name}: trained_on({style!r}) must be TrainedOn or None, got "
+                f"{type(record).__name__}"
+            )
+    return {style: record for style, record in found.items() if record is not None}
 
 
 class Moments:
@@ -230,7 +252,13 @@ def write_backgrounds(
     files = {
         path: file for time in moments.times for path, file in done[str(time)]["files"].items()
     }
-    return {"card": editing.card, "styles": list(editing.styles)}, files
+    entry: dict[str, Any] = {"card": editing.card, "styles": list(editing.styles)}
+    if editing.records:
+        data = TrainedOn.union(editing.records.values()).as_bytes()
+        _files.write_whole(work / TRAINED_ON, data)
+        files[TRAINED_ON] = digest_record(data)
+        entry["recorded"] = list(editing.records)
+    return entry, files
 
 
 def _edited(editor: BackgroundEditor, moment: Moment, style: str) -> Sequence[NDArray[np.uint8]]:

@@ -13,6 +13,9 @@ from weather_aug.errors import printable
 from weather_aug.scene.records import FrameRecord, StoredFile
 
 BACKGROUNDS = "backgrounds"
+TRAINED_ON = f"{BACKGROUNDS}/trained_on.txt"
+"""Digests of all pictures that trained the editor, where that is known; see
+`edit.diffusion.leakage`."""
 MOST_CARD_BYTES = 64 * 1024
 """Of an editor's card as JSON text; see `edit.background.BackgroundEditor`."""
 
@@ -25,6 +28,14 @@ class BackgroundsRecord:
     """Of the editor that made them, JSON values: all that the pictures depend on."""
     styles: tuple[str, ...]
     """Every frame has a picture in each."""
+    recorded: tuple[str, ...] = ()
+    """Of them, those of which TRAINED_ON tells what the editor learnt them from; none in a scene of
+    before that was kept, and where nobody recorded it."""
+
+    @property
+    def unrecorded(self) -> tuple[str, ...]:
+        """Styles of which nobody can tell what the editor learnt them from."""
+        return tuple(style for style in self.styles if style not in self.recorded)
 
 
 def background_path(style: str, key: FrameKey) -> str:
@@ -50,4 +61,14 @@ def parse_backgrounds(
         for style in styles:
             if background_path(style, record.key) not in files:
                 raise ValueError(f"frame {record.key} has no background in {style}")
-    return BackgroundsRecord(card, tuple(styles))
+    return BackgroundsRecord(card, tuple(styles), _recorded(entry.get("recorded"), styles, files))
+
+
+def _recorded(recorded: Any, styles: list[str], files: Mapping[str, StoredFile]) -> tuple[str, ...]:
+    if recorded is None:
+        return ()
+    if not isinstance(recorded, list) or not recorded or len(set(recorded)) < len(recorded):
+        raise ValueError("backgrounds must have a list of recorded styles, each once, or none")
+    if not set(recorded) <= set(styles) or TRAINED_ON not in files:
+        raise ValueError(f"recorded styles of backgrounds need {TRAINED_ON} and backgrounds")
+    return tuple(recorded)

@@ -7,6 +7,7 @@
     frames/000012_front.boxes.json      tracked boxes, where there are any
     frames/000012_front.layers.npy …    what the editor knows of it; see `weather_aug.scene.layers`
     backgrounds/snow/000012_front.png   the picture in a style, where an editor made them before
+    backgrounds/trained_on.txt          digests of what trained that editor, where it is known
     shelter.npy                         (A, L) float32 undersides over the street, if there are any
     gaussians/…                         the drive as Gaussians, if they were asked for; see
                                         `weather_aug.scene.reconstruction`
@@ -32,11 +33,12 @@ from weather_aug import _files
 from weather_aug._png import png_bytes
 from weather_aug.clip.types import Camera, Frame
 from weather_aug.edit.ambience import Ambience
+from weather_aug.edit.diffusion.leakage import TrainedOn
 from weather_aug.edit.physical.layers import Layers
 from weather_aug.errors import ArgumentError, DataError, IntegrityError, SceneError, printable
 from weather_aug.particles.shelter import Shelter
 from weather_aug.scene.arrays import mapped, npy_bytes
-from weather_aug.scene.backgrounds_record import parse_backgrounds
+from weather_aug.scene.backgrounds_record import TRAINED_ON, parse_backgrounds
 from weather_aug.scene.boxes import encode_boxes, read_boxes
 from weather_aug.scene.layers import PARTS as LAYER_PARTS
 from weather_aug.scene.layers import read_layers as stored_layers
@@ -255,6 +257,18 @@ def read_shelter(folder: Path, manifest: Manifest) -> Shelter | None:
         raise SceneError(
             f"{printable(folder / SHELTER, 200)}: {error}; build the scene again"
         ) from None
+
+
+def read_trained_on(folder: Path, manifest: Manifest) -> TrainedOn | None:
+    """What the editor of the backgrounds was trained on, as far as the scene knows; else None.
+
+    Raises:
+        DataError: If its file cannot be read.
+        IntegrityError: If it has other bytes than were recorded.
+    """
+    if manifest.backgrounds is None or not manifest.backgrounds.recorded:
+        return None
+    return TrainedOn.read_file(folder / TRAINED_ON, manifest.files[TRAINED_ON].sha256)
 
 
 def _check_label(frame: Frame) -> None:

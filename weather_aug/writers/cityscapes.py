@@ -12,7 +12,7 @@ GTADataset looks for that name in its folder of labels itself, so its labels mus
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +24,7 @@ from weather_aug.writers import layout
 MIN_PIXELS = 3_000
 """A file counts for a class if it has more pixels of it than this."""
 
-PathOf = Callable[[int], str | None]
+LabelPaths = Callable[[], Iterable[str | None]]
 
 
 class ClassStats:
@@ -51,49 +51,72 @@ class ClassStats:
         occurring = np.flatnonzero(self._pixels.max(axis=0))
         return tuple(int(train_id) for train_id in occurring if train_id not in self.kept)
 
-    def write(self, out: Path, label_path: PathOf) -> tuple[str, ...]:
+    def write(
+        self, out: Path, label_paths: LabelPaths, *, progress: bool = False
+    ) -> tuple[str, ...]:
         """Write the three files; their names come back.
 
         Args:
             out: The export.
-            label_path: Relative path of a sample's label, None where it has none.
+            label_paths: Gives the relative path of each sample's label in order, None where it has
+                none; called once for each file and class, so that no list of paths is needed.
+            progress: Show a bar if it takes more than a moment.
         """
-        chunks_by_name = {
-            layout.CLASS_STATS: _json_chunks("[]", self._rows(label_path)),
-            layout.CLASS_STATS_DICT: _json_chunks("{}", self._dict_rows(label_path)),
-            layout.SAMPLES_WITH_CLASS: self._class_chunks(label_path),
-        }
-        for name, chunks in chunks_by_name.items():
-            with _files.whole_file(out / name) as file:
-                file.writelines(chunk.encode() for chunk in chunks)
-                file.write(b"\n")
+        from tqdm.auto import tqdm
+
+        kept = self.kept
+        with tqdm(
+            total=(2 + len(kept)) * len(self._pixels),
+            desc="classes",
+            unit="row",
+            unit_scale=True,
+            delay=1.0,
+            disable=not progress,
+        ) as bar:
+
+            def paths() -> Iterator[str | None]:
+                for path in label_paths():
+                    yield path
+                    bar.update()
+
+            chunks_by_name = {
+                layout.CLASS_STATS: _json_chunks("[]", self._rows(kept, paths)),
+                layout.CLASS_STATS_DICT: _json_chunks("{}", self._dict_rows(kept, paths)),
+                layout.SAMPLES_WITH_CLASS: self._class_chunks(kept, paths),
+            }
+            for name, chunks in chunks_by_name.items():
+                with _files.whole_file(out / name) as file:
+                    file.writelines(chunk.encode() for chunk in chunks)
+                    file.write(b"\n")
         return tuple(chunks_by_name)
 
-    def _samples(self, label_path: PathOf) -> Iterator[tuple[str, dict[str, int]]]:
-        kept = self.kept
-        for index, row in enumerate(self._pixels):
-            path = label_path(index)
+    def _samples(
+        self, kept: Sequence[int], label_paths: LabelPaths
+    ) -> Iterator[tuple[str, dict[str, int]]]:
+        for path, row in zip(label_paths(), self._pixels, strict=True):
             if path is not None:
-                yield path, {str(c): int(row[c]) for c in kept if row[c]}
+                pixels = row.tolist()
+                yield path, {str(c): pixels[c] for c in kept if pixels[c]}
 
-    def _rows(self, label_path: PathOf) -> Iterator[str]:
-        return (json.dumps({**stats, "file": path}) for path, stats in self._samples(label_path))
+    def _rows(self, kept: Sequence[int], label_paths: LabelPaths) -> Iterator[str]:
+        for path, stats in self._samples(kept, label_paths):
+            yield json.dumps({**stats, "file": path})
 
-    def _dict_rows(self, label_path: PathOf) -> Iterator[str]:
-        for path, stats in self._samples(label_path):
+    def _dict_rows(self, kept: Sequence[int], label_paths: LabelPaths) -> Iterator[str]:
+        for path, stats in self._samples(kept, label_paths):
             yield f"{json.dumps(path)}: {json.dumps(stats)}"
 
-    def _class_chunks(self, label_path: PathOf) -> Iterator[str]:
+    def _class_chunks(self, kept: Sequence[int], label_paths: LabelPaths) -> Iterator[str]:
         yield "{"
-        for number, train_id in enumerate(self.kept):
+        for number, train_id in enumerate(kept):
             yield (",\n" if number else "\n") + f'"{train_id}": '
-            yield from _json_chunks("[]", self._files_of(train_id, label_path))
+            yield from _json_chunks("[]", self._files_of(train_id, label_paths))
         yield "\n}"
 
-    def _files_of(self, train_id: int, label_path: PathOf) -> Iterator[str]:
-        column = self._pixels[:, train_id]
-        for index in np.flatnonzero(column):
-            yield json.dumps([label_path(int(index)), int(column[index])])
+    def _files_of(self, train_id: int, label_paths: LabelPaths) -> Iterator[str]:
+        for path, pixels in zip(label_paths(), self._pixels[:, train_id], strict=True):
+            if pixels:
+                yield f"[{json.dumps(path)}, {pixels}]"
 
 
 def _json_chunks(brackets: str, rows: Iterable[str]) -> Iterator[str]:

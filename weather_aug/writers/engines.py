@@ -65,7 +65,7 @@ def run_processes(
             yield from crew.finished()
     finally:
         crew.stop()
-    crew.losses.raise_if_any()
+    crew.losses.settle()
 
 
 class Losses:
@@ -87,15 +87,22 @@ class Losses:
             return True
         self._lost.append(unit)
         if len(self._lost) >= MAX_QUARANTINED:
-            self.raise_if_any()
+            self._raise_if_any()
         return False
 
-    def raise_if_any(self) -> None:
-        """Name the items of units that no worker survived, if there are any.
+    def settle(self) -> None:
+        """Remove what dead workers half wrote, and name the items that none of them survived.
+
+        Call it when no worker writes any more.
 
         Raises:
-            IntegrityError: If there are.
+            IntegrityError: If there are such items.
         """
+        if self._deaths:
+            self._target.remove_leftovers(self._plan.layout)
+        self._raise_if_any()
+
+    def _raise_if_any(self) -> None:
         if not self._lost:
             return
         items = [index for unit in self._lost for index in self._plan.items_of(unit)]

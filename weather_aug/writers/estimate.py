@@ -13,8 +13,10 @@ import numpy as np
 from weather_aug.errors import DataError, IntegrityError
 from weather_aug.render.compose import warm_up
 from weather_aug.writers import layout
+from weather_aug.writers.journal import committed_items
 from weather_aug.writers.plan import ExportPlan
 from weather_aug.writers.sample import rendered
+from weather_aug.writers.shards import WHOLE, Shard, shard_journals
 from weather_aug.writers.spread import spread_items
 
 MOST_SAMPLES = 32
@@ -99,19 +101,27 @@ def _cost(plan: ExportPlan, item: int) -> tuple[int, float]:
     return sum(len(data) for data in parts.values()), time.perf_counter() - start_s
 
 
-def committed(out: Path) -> int:
-    """How many samples an export holds so far, as its journal or its `export.json` says.
+def committed(state: Path, plan: ExportPlan, shard: Shard = WHOLE) -> int:
+    """How many samples an export holds so far, as its journals or its `export.json` say.
 
     Files are not looked at: some may turn out damaged. What cannot be read counts as nothing;
     `export` says why.
+
+    Args:
+        state: Folder of the export, or the state of one at a url.
+        plan: What is exported.
+        shard: Of which samples are counted.
     """
-    contents, journal = out / layout.CONTENTS, out / layout.JOURNAL
     try:
-        if contents.exists():
-            return int(layout.read_contents(out)["samples"])
-        if not journal.exists():
-            return 0
-        with journal.open("rb") as file:
-            return max(0, sum(line.endswith(b"\n") for line in file) - 1)
+        if (state / layout.CONTENTS).exists():
+            whole = layout.read_contents(state)["samples"] == plan.count
+            return shard.count(plan) if whole else 0
+        items = np.zeros(plan.count, bool)
+        for journal in (state / layout.JOURNAL, *shard_journals(state)):
+            if journal.exists():
+                for item in committed_items(journal):
+                    if item < plan.count and shard.has(plan, item):
+                        items[item] = True
+        return int(items.sum())
     except (DataError, IntegrityError, OSError, KeyError):
         return 0

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -21,12 +22,14 @@ from weather_aug import _files
 from weather_aug.errors import DataError, IntegrityError, printable
 from weather_aug.writers import layout
 from weather_aug.writers.plan import ExportPlan
+from weather_aug.writers.shards import WHOLE, Shard
 from weather_aug.writers.target import Target
 
 SYNC_EVERY = 64
 """Lines between two syncs to disk: what a power cut can cost; a killed process loses none."""
 
 _SEAL_LENGTH = 16
+_ITEM = re.compile(rb'[0-9a-f]{16} \{"item": (\d+),')
 
 
 def sealed(text: str) -> bytes:
@@ -65,6 +68,16 @@ def write_journal(path: Path, job: dict[str, Any], lines: Iterable[str] = ()) ->
             file.write(sealed(line))
 
 
+def committed_items(path: Path) -> Iterator[int]:
+    """Items of a journal's lines, as far as they are complete; nothing else of them is read."""
+    with path.open("rb") as file:
+        file.readline()
+        for line in file:
+            item = _ITEM.match(line)
+            if item is not None and line.endswith(b"\n"):
+                yield int(item[1])
+
+
 class WholeFiles:
     """Whether samples' files are there with their sizes and (`digests`) their bytes.
 
@@ -92,19 +105,38 @@ class Journal:
     It keeps one offset an item in memory, not the lines.
     """
 
-    def __init__(self, plan: ExportPlan, target: Target, *, progress: bool = False) -> None:
+    def __init__(
+        self,
+        plan: ExportPlan,
+        target: Target,
+        shard: Shard = WHOLE,
+        others: Iterable[Path] = (),
+        *,
+        progress: bool = False,
+    ) -> None:
         """Open the journal of an output; lines whose files are not whole are dropped from it.
+
+        Args:
+            plan: What is exported.
+            target: Where to; its state holds the journal.
+            shard: The part of the plan that the journal is for.
+            others: Further journals of the job, whose lines are taken over; somebody may be writing
+                to them.
+            progress: Show a bar while files are compared.
 
         Raises:
             OutputError: If it cannot be written.
         """
         self.path = path = target.state / layout.JOURNAL
         self._plan = plan
+        self._units = shard.units(plan)
         self._offsets = np.full(plan.count, -1, np.int64)
+        self.items = shard.count(plan)
+        """How many items there are to commit."""
         self.committed = 0
         """How many items are committed."""
         self._unsynced = 0
-        lines = _Kept(path, plan, target, progress)
+        lines = _Kept([path, *others], plan, target, shard, progress)
         write_journal(path, plan.job, lines)
         self.damaged = lines.dropped
         with _files.reported(path), ExitStack() as opened:
@@ -116,7 +148,7 @@ class Journal:
 
     def missing(self) -> Iterator[int]:
         """Units with an item that is not committed, in order."""
-        for unit in range(self._plan.units):
+        for unit in self._units:
             items = self._plan.items_of(unit)
             if (self._offsets[items.start : items.stop] < 0).any():
                 yield unit
@@ -195,35 +227,51 @@ class Journal:
 
 
 class _Kept:
-    """The lines of an interrupted journal whose files are whole; counts the others."""
+    """The lines of interrupted journals whose files are whole, one an item; counts the others."""
 
-    def __init__(self, path: Path, plan: ExportPlan, target: Target, progress: bool) -> None:
-        self._path, self._plan, self._progress = path, plan, progress
+    def __init__(
+        self, paths: list[Path], plan: ExportPlan, target: Target, shard: Shard, progress: bool
+    ) -> None:
+        self._paths, self._plan, self._shard, self._progress = paths, plan, shard, progress
         self._whole = WholeFiles(target, digests=True)
-        self.dropped = 0
+        self._kept, self._damaged = np.zeros((2, plan.count), bool)
+        self._unreadable = 0
+
+    @property
+    def dropped(self) -> int:
+        """Lines that cannot be read, and items of which no line names whole files."""
+        return self._unreadable + int((self._damaged & ~self._kept).sum())
 
     def __iter__(self) -> Iterator[str]:
         from tqdm.auto import tqdm
 
-        seen = np.zeros(self._plan.count, bool)
-        with self._path.open("rb") as file:
-            file.readline()
-            for line in tqdm(file, desc="verify", unit="sample", disable=not self._progress):
-                text = unsealed(line)
-                index = None if text is None else self._whole_item(text)
-                if text is None or index is None:
-                    self.dropped += 1
-                elif not seen[index]:
-                    seen[index] = True
-                    yield text
+        with tqdm(desc="verify", unit="sample", disable=not self._progress) as bar:
+            for path in self._paths:
+                with path.open("rb") as file:
+                    file.readline()
+                    for line in file:
+                        bar.update()
+                        text = unsealed(line)
+                        planned = None if text is None else self._planned(text)
+                        if text is None or planned is None:
+                            self._unreadable += 1
+                        elif self._is_new_and_whole(*planned):
+                            yield text
 
-    def _whole_item(self, text: str) -> int | None:
-        """The item of a line if it is one of the plan's and its files are as written."""
+    def _planned(self, text: str) -> tuple[int, dict[str, Any]] | None:
+        """Item and files of a line if they are the plan's."""
         try:
-            entry = _files.parse_json(text, str(self._path))
+            entry = _files.parse_json(text, "journal")
             index, files = int(entry["item"]), entry["files"]
             paths = {part: file["path"] for part, file in files.items()}
             in_plan = 0 <= index < self._plan.count and paths == self._plan.files(index)
         except (DataError, KeyError, TypeError, ValueError, AttributeError):
             return None
-        return index if in_plan and self._whole(files) else None
+        return (index, files) if in_plan else None
+
+    def _is_new_and_whole(self, index: int, files: dict[str, Any]) -> bool:
+        if self._kept[index] or not self._shard.has(self._plan, index):
+            return False
+        whole = self._whole(files)
+        (self._kept if whole else self._damaged)[index] = True
+        return whole

@@ -6,6 +6,7 @@ sample_class_stats.json  sample_class_stats_dict.json  samples_with_class.json  
 manifest.jsonl                                              one line a sample, in item order
 export.json                                                 the job, counts, digests
 .export/                                                    lock and journal, until it is done
+.export/shards/                                             those of each shard
 """
 
 from __future__ import annotations
@@ -31,6 +32,10 @@ SAMPLES_WITH_CLASS = "samples_with_class.json"
 STATE = ".export"
 JOURNAL = f"{STATE}/journal"
 QUARANTINE = f"{STATE}/quarantine.jsonl"
+SHARDS = f"{STATE}/shards"
+"""Each folder in it is the state of a shard, which looks as the export's own."""
+MARK = f"{STATE}/job.json"
+"""At a url, the job that is being written there."""
 
 PARTS = ("image", "label", "invalid", "transmittance", "depth")
 """What a sample may consist of; label, invalid and depth where the scene knows them."""
@@ -169,10 +174,14 @@ def read_contents(out: Path) -> dict[str, Any]:
     """
     path = out / CONTENTS
     with path.open("rb") as file:
-        data = file.read(_files.MAX_JSON_BYTES + 1)
+        return checked_contents(file.read(_files.MAX_JSON_BYTES + 1), str(path))
+
+
+def checked_contents(data: bytes, path: str) -> dict[str, Any]:
+    """The fields of an `export.json`; see `read_contents`."""
     if len(data) > _files.MAX_JSON_BYTES:
         raise DataError(f"{printable(path, 200)} is larger than {_files.MAX_JSON_BYTES} bytes")
-    contents = _files.parse_json(data.decode(errors="replace"), str(path))
+    contents = _files.parse_json(data.decode(errors="replace"), path)
     if not isinstance(contents, dict) or contents.get("format") != FORMAT:
         raise IntegrityError(f"{printable(path, 200)} is not of a {FORMAT}")
     contents.pop("sha256", None)

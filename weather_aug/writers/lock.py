@@ -1,4 +1,11 @@
-"""One exporter per output: a lock that the system frees when its holder dies."""
+"""One exporter per output, or one per shard of it: locks that the system frees with their holders.
+
+An ordinary run holds the output's lock alone. Shards share that lock, and each holds one of its
+own, so that shards run beside each other, but neither beside an ordinary run nor twice. Machines
+exclude each other where `flock` reaches all of them, see `_lock`. Where it does not, whoever starts
+a run beside another loses time or has a run fail, but no samples: files are renamed into place
+whole, and a journal is believed line by line, by the digests of the files that it names.
+"""
 
 from __future__ import annotations
 
@@ -25,26 +32,54 @@ def exclusive(out: Path) -> Iterator[None]:
     """Hold the output `out` alone; its state folder goes with the lock unless work is left in it.
 
     Raises:
-        ConflictError: If another process holds it, or workers of a dead one still write.
+        ConflictError: If another process holds it or a shard of it, or workers of a dead one still
+            write.
         OutputError: If the lock cannot be written.
     """
-    state = out / layout.STATE
-    busy = f"{printable(out, 200)} is being exported to"
-    with _lock.exclusive(state / _LOCK, busy):
+    state, shards = out / layout.STATE, out / layout.SHARDS
+    with _lock.exclusive(state / _LOCK, _busy(out), shards.glob(f"*/{layout.STATE}/{_LOCK}")):
         try:
-            _wait_for_orphans(state)
+            for fences in (state, *shards.glob(f"*/{layout.STATE}")):
+                _wait_for_orphans(fences)
             yield
         finally:
             if not (out / layout.JOURNAL).exists():
-                with suppress(OSError):
-                    for file in state.iterdir():
-                        file.unlink()
-                    state.rmdir()
+                _remove(state)
+    # On NFS the lock kept its folder while it was open.
+    with suppress(OSError):
+        state.rmdir()
+
+
+@contextmanager
+def shared(out: Path, shard_state: Path, name: str) -> Iterator[None]:
+    """Hold one shard of the output `out` alone, and `out` with other shards.
+
+    Args:
+        out: Folder of the output, or the state of one at a url.
+        shard_state: What `out` is to an ordinary run.
+        name: Of the shard, for people.
+
+    Raises:
+        ConflictError: If another process holds the shard or the output, or workers of a dead one
+            still write.
+        OutputError: If a lock cannot be written.
+    """
+    own = shard_state / layout.STATE
+    with (
+        _lock.shared(out / layout.STATE / _LOCK, _busy(out)),
+        _lock.exclusive(own / _LOCK, f"{name} of {_busy(out)}"),
+    ):
+        for fences in (out / layout.STATE, own):
+            _wait_for_orphans(fences)
+        yield
 
 
 @contextmanager
 def working(out: Path) -> Iterator[None]:
     """Mark this process as a worker on `out`: no other exporter starts before it has left.
+
+    Args:
+        out: Folder of the output; the state of one at a url, or of a shard.
 
     Raises:
         ConflictError: If a new exporter already took the output over.
@@ -56,6 +91,21 @@ def working(out: Path) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+
+
+def _busy(out: Path) -> str:
+    return f"{printable(out, 200)} is being exported to"
+
+
+def _remove(state: Path) -> None:
+    """Remove a state folder, its lock last, as another exporter may start when that is gone."""
+    with suppress(OSError):
+        lock = state / _LOCK
+        for path in sorted(state.rglob("*"), reverse=True):
+            if path != lock:
+                path.rmdir() if path.is_dir() else path.unlink()
+        lock.unlink()
+        state.rmdir()
 
 
 def _wait_for_orphans(state: Path) -> None:

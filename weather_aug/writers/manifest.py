@@ -3,46 +3,63 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from weather_aug import _files
 from weather_aug.errors import DataError
 from weather_aug.writers import layout
 from weather_aug.writers.cityscapes import ClassStats
+from weather_aug.writers.editors import editors_of, write_records
 from weather_aug.writers.journal import Journal, WholeFiles
 from weather_aug.writers.plan import ExportPlan
 from weather_aug.writers.target import Target
 
 
-def finish(plan: ExportPlan, target: Target, journal: Journal) -> dict[str, Any]:
+def finish(
+    plan: ExportPlan, target: Target, journal: Journal, *, progress: bool = False
+) -> dict[str, Any]:
     """Write manifest, class statistics and `export.json` from a journal of all items.
+
+    Args:
+        plan: What was exported.
+        target: Where to.
+        journal: Which holds every item.
+        progress: Show bars if it takes more than a moment.
 
     Returns:
         The fields of `export.json`.
 
     Raises:
+        IntegrityError: If a scene's record of what trained its editor has changed.
         OutputError: If a file cannot be written.
     """
+    from tqdm.auto import tqdm
+
     out = target.state
     stats = ClassStats(plan.count)
     counts: Counter[str] = Counter()
     kinds: Counter[str] = Counter()
-    with _files.whole_file(out / layout.MANIFEST) as file:
-        for index in range(plan.count):
-            line = journal.line(index)
-            file.write(f"{line}\n".encode())
-            entry = json.loads(line)
-            stats.add(index, entry["class_pixels"])
-            kinds[entry["recipe"]["kind"]] += 1
-            parts = layout.parts_of(entry)
-            counts["labelled"] += "label" in parts
-            counts["bytes"] += sum(part["size"] for part in parts.values())
-    names = [layout.MANIFEST]
-    if counts["labelled"] and plan.layout.has_class_stats:
-        names += stats.write(out, lambda index: plan.paths(index).get("label"))
+    items = tqdm(range(plan.count), desc="manifest", unit="sample", delay=1.0, disable=not progress)
+    with _label_paths(journal.path.parent) as labels:
+        with _files.whole_file(out / layout.MANIFEST) as file:
+            for index in items:
+                line = journal.line(index)
+                file.write(f"{line}\n".encode())
+                entry = json.loads(line)
+                stats.add(index, entry["class_pixels"])
+                kinds[entry["recipe"]["kind"]] += 1
+                parts = layout.parts_of(entry)
+                labels.append(entry["files"].get("label", {}).get("path"))
+                counts["labelled"] += "label" in parts
+                counts["bytes"] += sum(part["size"] for part in parts.values())
+        names = [layout.MANIFEST]
+        if counts["labelled"] and plan.layout.has_class_stats:
+            names += stats.write(out, labels, progress=progress)
     contents = {
         "format": layout.FORMAT,
         "version": layout.VERSION,
@@ -52,23 +69,41 @@ def finish(plan: ExportPlan, target: Target, journal: Journal) -> dict[str, Any]
         "samples_by_kind": dict(sorted(kinds.items())),
         "classes": list(stats.kept),
         "dropped_classes": list(stats.dropped),
-        "editors": _editors(plan),
-        "files": {name: _stored(out / name) for name in names},
+        "editors": editors_of(plan.scenes),
+        "files": {name: _stored(out / name) for name in names + write_records(plan.scenes, out)},
     }
     _files.write_whole(out / layout.CONTENTS, layout.sealed_contents(contents))
     return contents
 
 
-def _editors(plan: ExportPlan) -> list[dict[str, Any]]:
-    """Editors of the scenes' stored backgrounds, each once; their cards say what trained them."""
-    made: list[dict[str, Any]] = []
-    for scene in plan.scenes:
-        record = scene.manifest.backgrounds
-        if record is not None:
-            editor = {"editor": scene.manifest.editor, "card": dict(record.card)}
-            if editor not in made:
-                made.append(editor)
-    return made
+class _LabelPaths:
+    """Paths of labels by item, in a file: to plan them anew takes minutes, a list 200 MB."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+
+    def append(self, path: str | None) -> None:
+        """The next item's; None where it has no label."""
+        self._file.write(f"{path or ''}\n")
+
+    def __call__(self) -> Iterator[str | None]:
+        """All of them, in order; one who asks again must have had them all."""
+        self._file.seek(0)
+        return (line.rstrip("\n") or None for line in self._file)
+
+
+@contextmanager
+def _label_paths(folder: Path) -> Iterator[_LabelPaths]:
+    """An empty list of them in a nameless file, which is gone after the block.
+
+    Raises:
+        OutputError: If it cannot be written.
+    """
+    with (
+        _files.reported(folder),
+        tempfile.TemporaryFile("w+", encoding="utf-8", dir=folder) as file,
+    ):
+        yield _LabelPaths(file)
 
 
 def is_finished_whole(

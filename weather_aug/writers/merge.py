@@ -2,6 +2,7 @@
 
     OUT/leftImg8bit  OUT/gtFine                  links to every file of the root and the exports
     OUT/sample_class_stats.json and two others   statistics of all training labels together
+    OUT/trained_on_….txt                         links to what trained the exports' editors, if any
     OUT/merge.json                               what was merged; it makes the folder a merge
 
 Links are relative, so that they hold where root, exports and merge are moved or mounted together.
@@ -12,6 +13,7 @@ says so. Root and exports are only read.
 from __future__ import annotations
 
 import errno
+import filecmp
 import json
 import os
 import time
@@ -35,12 +37,12 @@ from weather_aug.errors import (
 from weather_aug.taxonomy import CLASSES
 from weather_aug.writers import layout
 from weather_aug.writers.cityscapes import ClassStats
+from weather_aug.writers.editors import RECORD
 from weather_aug.writers.manifest import usable_lines
+from weather_aug.writers.merged import CONTENTS, FORMAT, is_merge, read_merge
 from weather_aug.writers.sample import class_pixels
 from weather_aug.writers.target import LocalFolder
 
-FORMAT = "weather_aug merge"
-CONTENTS = "merge.json"
 SPLIT = "train"
 """The split that exports join and that statistics count, as the trainers' converter does."""
 CONVERTER = "python tools/convert_datasets/cityscapes.py"
@@ -49,7 +51,7 @@ MAX_STATS_BYTES = 256 * 2**20
 
 _LOCK = ".merge.lock"
 _STATS = (layout.CLASS_STATS, layout.CLASS_STATS_DICT, layout.SAMPLES_WITH_CLASS)
-_OWN = {CONTENTS, _LOCK, *_STATS, *(name + _files.TEMPORARY_SUFFIX for name in (CONTENTS, *_STATS))}
+_OWN = {CONTENTS, _LOCK, *_STATS}
 _IMAGE, _LABEL = "_leftImg8bit.png", "_gtFine_labelTrainIds.png"
 
 
@@ -82,6 +84,10 @@ class _Source(NamedTuple):
     """What each relative path links to."""
     labels: dict[str, Mapping[str, int]]
     """Class pixels of each training label, by relative path."""
+    editors: list[Any] | None
+    """Of an export's backgrounds, see `writers.editors`; None where nobody noted them."""
+    records: dict[str, Mapping[str, Any]]
+    """Size and digest of each record of what trained them, by name."""
     counted: int = 0
 
 
@@ -124,6 +130,7 @@ def merge_cityscapes(
     busy = f"{printable(out, 200)} is being merged"
     with _lock.exclusive(out / _LOCK, busy), _files.reported(out):
         try:
+            _files.remove_temporaries(out)
             foreign = _foreign_file(out, merged.files)
             if foreign is not None:
                 raise ConflictError(
@@ -132,7 +139,7 @@ def merge_cityscapes(
                 )
             for name in _STATS:
                 (out / name).unlink(missing_ok=True)
-            _files.write_whole(out / CONTENTS, _contents(out, root, exports))
+            _files.write_whole(out / CONTENTS, _contents(out, root, exports, merged))
             removed = _removed(out, merged.files)
             linked = sum(_linked(out / path, to, hard) for path, to in merged.files.items())
             stats = _written_stats(out, merged.labels)
@@ -164,20 +171,12 @@ def _checked_out(out: Path, sources: list[Path]) -> Path:
         if out.exists() and not out.is_dir():
             raise OutputError(f"{printable(out, 200)} is not a folder; choose another output")
         found = {path.name for path in out.iterdir()} - {_LOCK} if out.exists() else set()
-    if found and not _is_merge(out):
+    if found and not is_merge(out):
         raise ConflictError(
             f"{printable(out, 200)} is no merge, but holds {printable(sorted(found)[0])}; choose "
             "an empty or new folder"
         )
     return out
-
-
-def _is_merge(out: Path) -> bool:
-    try:
-        contents = _files.read_json(out / CONTENTS)
-    except DataError:
-        return False
-    return isinstance(contents, dict) and contents.get("format") == FORMAT
 
 
 def _source_of_root(root: Path, progress: bool) -> _Source:
@@ -209,7 +208,13 @@ def _source_of_root(root: Path, progress: bool) -> _Source:
     labels: dict[str, Mapping[str, int]] = {
         path: counted[path] if path in counted else known[Path(path).name] for path in paths
     }
-    return _Source(files, labels, len(unknown))
+    if not (root / CONTENTS).exists():
+        # Nobody edited recorded pictures.
+        return _Source(files, labels, [], {}, len(unknown))
+    # A merge has exports in it.
+    contents = read_merge(root)
+    files |= {name: (root / name).resolve() for name in contents["files"]}
+    return _Source(files, labels, contents["editors"], contents["files"], len(unknown))
 
 
 def _files_below(root: Path, part: str) -> Iterator[tuple[str, Path]]:
@@ -288,7 +293,12 @@ def _source_of_export(export: Path) -> _Source:
         labels[entry["files"]["label"]["path"]] = entry["class_pixels"]
     if len(labels) != contents["samples"]:
         raise _damaged(export, layout.MANIFEST)
-    return _Source(files, labels)
+    records = {name: stored for name, stored in contents["files"].items() if RECORD.fullmatch(name)}
+    for name, stored in records.items():
+        if not folder.is_whole(name, stored, digests=True):
+            raise _damaged(export, name)
+        files[name] = export / name
+    return _Source(files, labels, contents.get("editors"), records)
 
 
 def _damaged(export: Path, path: str) -> IntegrityError:
@@ -307,6 +317,8 @@ def _united(sources: Sequence[_Source]) -> _Source:
     files: dict[str, Path] = {}
     labels: dict[str, Mapping[str, int]] = {}
     places: dict[str, Path] = {}
+    editors: list[Any] | None = []
+    records: dict[str, Mapping[str, Any]] = {}
     for source in sources:
         for path, pixels in source.labels.items():
             name, place = Path(path).name, source.files[path]
@@ -316,18 +328,26 @@ def _united(sources: Sequence[_Source]) -> _Source:
                     "name, by which trainers tell labels apart; give each export once"
                 )
             labels[path], places[name] = pixels, place
-        files |= source.files
-    return _Source(files, labels, sum(source.counted for source in sources))
+        # Records of one name are the same record.
+        files = source.files | files
+        records |= source.records
+        if editors is not None and source.editors is not None:
+            editors += [editor for editor in source.editors if editor not in editors]
+        else:
+            editors = None
+    return _Source(files, labels, editors, records, sum(source.counted for source in sources))
 
 
-def _contents(out: Path, root: Path, exports: Sequence[Path]) -> bytes:
-    """`merge.json`: where the sources are, seen from the merge."""
+def _contents(out: Path, root: Path, exports: Sequence[Path], merged: _Source) -> bytes:
+    """`merge.json`: where the sources are, seen from the merge, and what trained their editors."""
     fields = {
         "format": FORMAT,
         "root": os.path.relpath(root, out),
         "exports": [os.path.relpath(export, out) for export in exports],
+        "editors": merged.editors,
+        "files": merged.records,
     }
-    return (json.dumps(fields, indent=1) + "\n").encode()
+    return layout.sealed_contents(fields)
 
 
 def _entries(out: Path) -> Iterator[tuple[str, Path]]:
@@ -344,10 +364,16 @@ def _entries(out: Path) -> Iterator[tuple[str, Path]]:
 def _foreign_file(out: Path, files: Mapping[str, Path]) -> Path | None:
     """A file in `out` that is neither a link nor the same file as one that shall be linked to."""
     for relative, path in _entries(out):
-        if path.is_symlink() or (relative in files and path.samefile(files[relative])):
-            continue
-        return path
+        if not path.is_symlink() and not (relative in files and _is(path, files[relative])):
+            return path
     return None
+
+
+def _is(path: Path, to: Path) -> bool:
+    """Whether a file is a hard link to another, or the same record from another export."""
+    return path.samefile(to) or (
+        RECORD.fullmatch(path.name) is not None and filecmp.cmp(path, to, shallow=False)
+    )
 
 
 def _removed(out: Path, files: Mapping[str, Path]) -> int:
@@ -390,5 +416,5 @@ def _written_stats(out: Path, labels: Mapping[str, Mapping[str, int]]) -> ClassS
     stats = ClassStats(len(paths))
     for index, pixels in enumerate(labels.values()):
         stats.add(index, pixels)
-    stats.write(out, lambda index: paths[index])
+    stats.write(out, lambda: paths)
     return stats

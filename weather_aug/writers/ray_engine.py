@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import faulthandler
 import json
+import logging
 import os
 import signal
 import socket
@@ -58,7 +59,6 @@ START_WAIT_S = 600.0
 CONNECT_WAIT_S = 10.0
 
 _OBJECT_STORE_BYTES = 100 * 2**20
-_TOKEN = f"{STATE}/ray"
 
 Answer = tuple[str, Any]
 """READY and None, DONE and manifest lines, or FAILED and (error, traceback)."""
@@ -112,13 +112,13 @@ def run_ray(
                 yield from cast.finished()
         finally:
             cast.stop()
-    cast.losses.raise_if_any()
+    cast.losses.settle()
 
 
 class Renderer:
     """What runs in an actor. Its errors are answers, so that they arrive as they were raised."""
 
-    def __init__(self, plan: ExportPlan, target: Target, token: bytes, job: dict[str, Any]) -> None:
+    def __init__(self, plan: ExportPlan, target: Target, token: str, job: dict[str, Any]) -> None:
         """Keep what is rendered; `begin` checks it."""
         self._plan, self._target, self._token, self._job = plan, target, token, job
         self._held = ExitStack()
@@ -135,15 +135,21 @@ class Renderer:
         cv2.setNumThreads(1)
         _check_same_job(replace(self._plan).job, self._job)
         self._plan.check_scenes()
-        stored = {"size": len(self._token), "sha256": _files.sha256_of(self._token)}
-        if not self._target.is_whole(_TOKEN, stored, digests=True):
+        token, file = self._token.encode(), _token_file(self._token)
+        stored = {"size": len(token), "sha256": _files.sha256_of(token)}
+        if not self._target.is_whole(file, stored, digests=True):
             raise OutputError(
                 f"a Ray actor on {printable(os.uname().nodename)} does not see what the exporter "
                 f"wrote to {printable(self._target, 200)}; export to a place that all nodes share"
             )
         state = self._target.state
-        if (state / _TOKEN).is_file() and (state / _TOKEN).read_bytes() == self._token:
+        if (state / file).is_file():
             self._held.enter_context(working(state))
+
+
+def _token_file(token: str) -> str:
+    """What an exporter writes for its actors to find; shards at one output must not meet here."""
+    return f"{STATE}/ray-{token}"
 
 
 def _answer(kind: str, work: Callable[[], Any]) -> Answer:
@@ -187,10 +193,10 @@ class _Cast:
         units: Iterator[int],
         cpus_per_actor: float,
     ) -> None:
-        token = uuid.uuid4().hex.encode()
+        token = uuid.uuid4().hex
         target.make_folders([STATE])
-        target.write_whole(_TOKEN, token)
-        _files.write_whole(target.state / _TOKEN, token)
+        target.write_whole(_token_file(token), token.encode())
+        _files.write_whole(target.state / _token_file(token), token.encode())
         self.waiting: dict[Any, _Seat] = {}
         """Who owes which answer."""
         self.losses = Losses(plan, target)
@@ -298,6 +304,7 @@ def _connected(address: str | None, local_cpus: int) -> Iterator[ModuleType]:
         before = dict(os.environ)
         ray = require("ray", extra="ray", to="export with Ray actors")
         if not ray.is_initialized():
+            undone.enter_context(_without_warnings())
             try:
                 _connect(ray, address, local_cpus)
             finally:
@@ -348,6 +355,18 @@ def _undo_environment(before: dict[str, str], during: dict[str, str]) -> None:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = old
+
+
+@contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Keep advice to who runs a cluster off stderr, where this package says one sentence."""
+    logger = logging.getLogger("ray")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 @contextmanager

@@ -18,20 +18,16 @@ from weather_aug.errors import (
     ArgumentError,
     ConflictError,
     DataError,
-    MissingExtraError,
-    OutputError,
-    WeatherAugError,
     printable,
 )
-from weather_aug.writers.layout import CONTENTS, JOURNAL, STATE, Layout, sealed_contents
+from weather_aug.writers.layout import CONTENTS, JOURNAL, MARK, STATE, Layout, sealed_contents
+from weather_aug.writers.place import Place
 
 STATES = Path(".weather-aug-export")
 """Where the states of exports to urls stand if nobody chooses, in the working directory."""
 
 _PUTS_WHOLE = {"s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "oss", "oci", "tos", "memory"}
 """Protocols of stores where an object appears when it is complete, and not before."""
-
-_MARK = f"{STATE}/job.json"
 
 
 def default_state(url: str) -> Path:
@@ -63,8 +59,6 @@ class FsspecFolder:
             ArgumentError: If fsspec does not know the url, or the place can write no file whole.
             MissingExtraError: If the package of the file system is not installed.
         """
-        if "::" in self.url:
-            raise ArgumentError(f"{self} is a chain of file systems; give the url of the last one")
         if not self._puts_whole and not self._renames:
             raise ArgumentError(
                 f"{self} can neither put nor rename a file in one step, so a killed export could "
@@ -82,8 +76,8 @@ class FsspecFolder:
         Raises:
             OutputError: If the place does not answer: that is no damage.
         """
-        path = self._path(relative)
-        with self._reported(relative, "read"):
+        path = self.place.path(relative)
+        with self.place.reported(relative, "read"):
             try:
                 if self._fs.info(path)["size"] != stored["size"]:
                     return False
@@ -96,8 +90,8 @@ class FsspecFolder:
         if self._puts_whole:
             return
         for relative in relatives:
-            with self._reported(relative):
-                self._fs.makedirs(self._path(relative), exist_ok=True)
+            with self.place.reported(relative, "write"):
+                self._fs.makedirs(self.place.path(relative), exist_ok=True)
 
     def remove_leftovers(self, layout: Layout) -> None:
         """Temporary files, where the place needs any, and those of the state."""
@@ -107,8 +101,8 @@ class FsspecFolder:
                 local.unlink()
         if self._puts_whole:
             return
-        with self._reported(""):
-            for path in [*self._entries(), *self._below((*layout.roots, STATE))]:
+        with self.place.reported("", "write"):
+            for path in [*self.place.entries(), *self.place.below((*layout.roots, STATE))]:
                 if path.endswith(suffix):
                     self._fs.rm_file(path)
 
@@ -119,16 +113,16 @@ class FsspecFolder:
             ConflictError: If it holds something else, of which the state does not know either.
             OutputError: If it cannot be read.
         """
-        for name in (_MARK, CONTENTS):
+        for name in (MARK, CONTENTS):
             found = self._json(name)
             if isinstance(found, dict) and isinstance(found.get("job"), dict):
                 # One that was changed names no job; it is published anew, if the state knows it.
-                if name == _MARK or _is_sealed(found):
+                if name == MARK or _is_sealed(found):
                     return found["job"]
         if any((self.state / name).exists() for name in (JOURNAL, CONTENTS)):
             return None
-        with self._reported("", "read"):
-            foreign = sorted(path.rstrip("/").rpartition("/")[2] for path in self._entries())
+        with self.place.reported("", "read"):
+            foreign = sorted(path.rstrip("/").rpartition("/")[2] for path in self.place.entries())
         if foreign and foreign != [STATE]:
             raise ConflictError(
                 f"{self} is no export, but holds {printable(foreign[0])}; choose an empty or new "
@@ -136,12 +130,21 @@ class FsspecFolder:
             )
         return None
 
+    def finished_contents(self) -> dict[str, Any] | None:
+        """`export.json` of an export that was finished there; None while one is being written.
+
+        Raises:
+            OutputError: If it cannot be read.
+        """
+        found = None if self._json(MARK) is not None else self._json(CONTENTS)
+        return found if isinstance(found, dict) and "job" in found and _is_sealed(found) else None
+
     def begin(self, job: Mapping[str, Any]) -> None:
         """Mark the place as one that `job` is written to, and as not finished."""
         self.make_folders([STATE])
-        self.write_whole(_MARK, json.dumps({"job": job}, allow_nan=False).encode())
-        with self._reported(CONTENTS), suppress(FileNotFoundError):
-            self._fs.rm_file(self._path(CONTENTS))
+        self.write_whole(MARK, json.dumps({"job": job}, allow_nan=False).encode())
+        with self.place.reported(CONTENTS, "write"), suppress(FileNotFoundError):
+            self._fs.rm_file(self.place.path(CONTENTS))
 
     def publish(self, names: Iterable[str]) -> None:
         """Copy root files that are not there whole beside the samples, then remove the mark.
@@ -156,33 +159,21 @@ class FsspecFolder:
             if not self.is_whole(name, stored, digests=True):
                 with self._appearing(name) as path:
                     self._fs.put_file(str(local), path)
-        with self._reported(STATE):
-            for path in self._below([STATE]):
+        with self.place.reported(STATE, "write"):
+            for path in self.place.below([STATE]):
                 self._fs.rm_file(path)
             # A store of objects has no folder that could be left.
             with suppress(OSError, NotImplementedError):
-                self._fs.rmdir(self._path(STATE))
+                self._fs.rmdir(self.place.path(STATE))
 
     @cached_property
-    def _place(self) -> tuple[Any, str]:
-        """File system, and the folder's path in it."""
-        core = require("fsspec.core", extra="remote", to="export to a url")
-        try:
-            fs, root = core.url_to_fs(self.url, **self.options)
-        except ImportError as error:
-            raise MissingExtraError(f"{self} needs a package: {error}") from error
-        except (ValueError, TypeError) as error:
-            raise ArgumentError(f"{self} cannot be opened: {printable(error, 200)}") from error
-        except Exception as error:
-            raise OutputError(f"{self} cannot be reached: {_told(error)}") from error
-        return fs, root.rstrip("/")
+    def place(self) -> Place:
+        """The place that files go to."""
+        return Place(self.url, self.options)
 
     @property
     def _fs(self) -> Any:
-        return self._place[0]
-
-    def _path(self, relative: str) -> str:
-        return f"{self._place[1]}/{relative}".rstrip("/")
+        return self.place.fs
 
     @cached_property
     def _puts_whole(self) -> bool:
@@ -198,8 +189,8 @@ class FsspecFolder:
     @contextmanager
     def _appearing(self, relative: str) -> Iterator[str]:
         """Where to write so that the file appears under its name when the block ends."""
-        path = self._path(relative)
-        with self._reported(relative):
+        path = self.place.path(relative)
+        with self.place.reported(relative, "write"):
             if self._puts_whole:
                 yield path
                 return
@@ -227,42 +218,16 @@ class FsspecFolder:
         with self._fs.open(path, "rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
 
-    def _entries(self) -> list[str]:
-        """Paths at the root."""
-        # What other processes wrote since a listing was kept must be seen.
-        self._fs.invalidate_cache()
-        try:
-            return list(self._fs.ls(self._path(""), detail=False))
-        except FileNotFoundError:
-            return []
-
-    def _below(self, folders: Iterable[str]) -> Iterator[str]:
-        """Paths of all files in some folders."""
-        self._fs.invalidate_cache()
-        for folder in folders:
-            yield from self._fs.find(self._path(folder))
-
     def _json(self, relative: str) -> Any:
         """A JSON file's value; None if it is absent or not one."""
-        path = self._path(relative)
-        with self._reported(relative, "read"):
+        path = self.place.path(relative)
+        with self.place.reported(relative, "read"):
             try:
                 if self._fs.info(path)["size"] > _files.MAX_JSON_BYTES:
                     return None
                 return _files.parse_json(self._fs.cat_file(path).decode(), str(self))
             except (FileNotFoundError, UnicodeDecodeError, DataError):
                 return None
-
-    @contextmanager
-    def _reported(self, relative: str, verb: str = "write") -> Iterator[None]:
-        """Turn whatever a file system raises into one sentence that names the url."""
-        try:
-            yield
-        except (WeatherAugError, MemoryError):
-            raise
-        except Exception as error:
-            where = f"{self}/{printable(relative, 200)}".rstrip("/")
-            raise OutputError(f"cannot {verb} {where}: {_told(error)}") from error
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Workers open the place themselves.
@@ -275,16 +240,10 @@ class FsspecFolder:
         return (FsspecFolder, (self.url, self.state, dict(self.options)))
 
     def __str__(self) -> str:
-        """The url without user and password."""
-        protocol, _, rest = self.url.partition("?")[0].partition("://")
-        host, slash, path = rest.partition("/")
-        return printable(f"{protocol}://{host.rpartition('@')[2]}{slash}{path.rstrip('/')}", 200)
+        """The url without user, password and query."""
+        return str(self.place)
 
     __repr__ = __str__
-
-
-def _told(error: Exception) -> str:
-    return printable(f"{type(error).__name__} {error}".rstrip(), 300)
 
 
 def _is_sealed(contents: Mapping[str, Any]) -> bool:

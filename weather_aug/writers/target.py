@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -73,6 +74,8 @@ class LocalFolder:
     def make_folders(self, relatives: Iterable[str]) -> None:
         """Each with its parents, durably."""
         with _files.reported(self.path):
+            # The state's name first: after a power cut, samples without it would be nobody's.
+            _files.sync_folder(self.path)
             for relative in relatives:
                 folder = self.path / relative
                 folder.mkdir(parents=True, exist_ok=True)
@@ -82,11 +85,13 @@ class LocalFolder:
 
     def remove_leftovers(self, layout: Layout) -> None:
         """Temporary files, of the root files and the state, too."""
+        temporary = f"*{_files.TEMPORARY_SUFFIX}"
         with _files.reported(self.path):
-            suffix = _files.TEMPORARY_SUFFIX
-            for folder in (self.path, self.path / STATE):
-                for path in folder.glob(f"*{suffix}"):
-                    path.unlink()
-            for root in layout.roots:
-                for path in (self.path / root).rglob(f"*{suffix}"):
-                    path.unlink()
+            found = [
+                *(self.path.glob(temporary), (self.path / STATE).glob(temporary)),
+                *((self.path / root).rglob(temporary) for root in layout.roots),
+            ]
+            for path in chain.from_iterable(found):
+                # A folder may be called so, and a writer that lost touch may end meanwhile.
+                if not path.is_dir():
+                    path.unlink(missing_ok=True)

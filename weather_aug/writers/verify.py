@@ -1,62 +1,70 @@
-"""Is an export on disk whole? Needs the export alone: neither its scenes nor a renderer."""
+"""Is an export whole? Needs the export alone: neither its scenes nor a renderer."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 from weather_aug import _files
-from weather_aug.errors import DataError, IntegrityError, printable
+from weather_aug.errors import DataError, IntegrityError, OutputError, printable
 from weather_aug.writers import layout
+from weather_aug.writers.source import (
+    Readable,
+    Source,
+    contents_of,
+    exists,
+    lines_of,
+    sha256_of,
+    source_of,
+)
 
 
-def verify_export(out: Path) -> list[str]:
+def verify_export(out: Readable) -> list[str]:
     """Compare every file of an export with what was recorded of it.
 
     Args:
-        out: Folder that `export` wrote.
+        out: Folder or url that `export` wrote to.
 
     Returns:
         One sentence for each problem: missing, changed and extra files, an unfinished job, a
         manifest that is not of this export. Empty if the export is whole.
+
+    Raises:
+        OutputError: If a url does not answer: that is no damage.
     """
-    out = Path(out)
-    if not (out / layout.CONTENTS).exists():
-        return [_unfinished(out)]
+    source = source_of(out)
+    if not exists(source, layout.CONTENTS):
+        return [_unfinished(source)]
     try:
-        contents = layout.read_contents(out)
+        contents = contents_of(source)
     except (DataError, IntegrityError) as error:
         return [str(error)]
-    except OSError as error:
-        return [f"{printable(out / layout.CONTENTS, 200)} cannot be read: {error.strerror}"]
     problems: list[str] = []
     try:
         expected = {layout.CONTENTS}
         for name, stored in contents["files"].items():
-            problems += _problems_of_file(out, name, stored)
+            problems += _problems_of_file(source, name, stored)
             expected.add(name)
-        problems += _problems_of_samples(out, contents, expected)
-        problems += _extra_files(out, expected)
+        problems += _problems_of_samples(source, contents, expected)
+        problems += _extra_files(source, expected)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        problems.append(f"{printable(out, 200)} is malformed: {type(error).__name__} {error}")
+        problems.append(f"{source} is malformed: {type(error).__name__} {error}")
     return problems
 
 
-def _unfinished(out: Path) -> str:
-    if (out / layout.JOURNAL).exists():
-        return f"{printable(out, 200)} is not finished; run the same export again to continue it"
-    return f"{printable(out, 200)} is not an export (no {layout.CONTENTS})"
+def _unfinished(source: Source) -> str:
+    if any(exists(source, name) for name in (layout.JOURNAL, layout.MARK)):
+        return f"{source} is not finished; run the same export again to continue it"
+    return f"{source} is not an export (no {layout.CONTENTS})"
 
 
-def _problems_of_samples(out: Path, contents: dict[str, Any], expected: set[str]) -> list[str]:
+def _problems_of_samples(source: Source, contents: dict[str, Any], expected: set[str]) -> list[str]:
     """Check every line of the manifest and the files that it names, which join `expected`."""
     problems: list[str] = []
     items_per_unit = max(1, int(contents["job"].get("items_per_unit", 1)))
     tar: dict[str, Any] | None = None
     lines = labels = 0
-    for lines, line in enumerate(_lines(out), 1):
+    for lines, line in enumerate(_lines(source), 1):
         try:
             entry = _files.parse_json(line, f"{layout.MANIFEST}, line {lines}")
             if entry["item"] != lines - 1:
@@ -70,7 +78,7 @@ def _problems_of_samples(out: Path, contents: dict[str, Any], expected: set[str]
                 if stored["path"] in expected:
                     problems.append(f"{printable(stored['path'], 200)} is listed twice")
                 expected.add(stored["path"])
-                problems += _problems_of_file(out, stored["path"], stored)
+                problems += _problems_of_file(source, stored["path"], stored)
             tar = entry["files"].get("tar")
             labels += "label" in layout.parts_of(entry)
         except DataError as error:
@@ -83,23 +91,25 @@ def _problems_of_samples(out: Path, contents: dict[str, Any], expected: set[str]
     return problems
 
 
-def _lines(out: Path) -> Iterator[str]:
+def _lines(source: Source) -> Iterator[str]:
     try:
-        with (out / layout.MANIFEST).open(encoding="utf-8", errors="replace") as file:
-            yield from file
-    except OSError:
+        yield from lines_of(source, layout.MANIFEST)
+    except OutputError:
+        raise
+    except (DataError, OSError):
         # That the manifest itself is missing has been said by its digest.
         return
 
 
-def _problems_of_file(out: Path, relative: str, stored: dict[str, Any]) -> list[str]:
+def _problems_of_file(source: Source, relative: str, stored: dict[str, Any]) -> list[str]:
     try:
-        path = _files.file_inside(out, relative)
-        size = path.stat().st_size
+        size = source.size(relative)
         if size != stored["size"]:
             return [f"{printable(relative, 200)} has {size} bytes, {stored['size']} were written"]
-        if _files.sha256_of_file(path) != stored["sha256"]:
+        if sha256_of(source, relative) != stored["sha256"]:
             return [f"{printable(relative, 200)} has changed since it was written"]
+    except OutputError:
+        raise
     except DataError as error:
         return [str(error)]
     except OSError as error:
@@ -107,12 +117,10 @@ def _problems_of_file(out: Path, relative: str, stored: dict[str, Any]) -> list[
     return []
 
 
-def _extra_files(out: Path, expected: set[str]) -> list[str]:
+def _extra_files(source: Source, expected: set[str]) -> list[str]:
     """Files that nothing lists; they are reported, never removed."""
-    problems = []
-    for folder, _, names in os.walk(out):
-        for name in sorted(names):
-            relative = (Path(folder) / name).relative_to(out).as_posix()
-            if relative not in expected:
-                problems.append(f"{printable(relative, 200)} is not part of the export")
-    return problems
+    return [
+        f"{printable(relative, 200)} is not part of the export"
+        for relative in source.files()
+        if relative not in expected
+    ]

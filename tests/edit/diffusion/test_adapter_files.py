@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -15,12 +16,15 @@ from tiny_diffusion import build_tiny_sd
 from weather_aug.edit.diffusion.adapted import AdaptedModel
 from weather_aug.edit.diffusion.adapter_files import (
     CARD,
+    TRAINED_ON_SHA256,
     WEIGHTS,
     load_adapter,
     read_card,
+    read_trained_on,
     save_adapter,
 )
 from weather_aug.edit.diffusion.base import load_base
+from weather_aug.edit.diffusion.leakage import TRAINED_ON, TrainedOn
 from weather_aug.edit.diffusion.spec import AdapterSpec, parse_spec
 from weather_aug.errors import DataError, IntegrityError, OutputError
 
@@ -153,3 +157,20 @@ def test_targets_that_the_base_lacks_are_the_adapters_fault(folder: Path, small_
     change_card(folder, lambda card: card["spec"].update(unet_targets=["no_such_layer"]))
     with pytest.raises(DataError, match="no_such_layer"):
         load_adapter(folder, load_base(str(small_base)))
+
+
+def test_the_card_names_the_record_of_what_trained_it(folder: Path) -> None:
+    """Without a name whatever stands there is believed; a named one is there as it was."""
+    assert read_trained_on(folder, read_card(folder)) is None
+    record = TrainedOn(frozenset(["0" * 64, "1" * 64]))
+    record.write(folder)
+    assert read_trained_on(folder, read_card(folder)) == record
+    sha256 = hashlib.sha256(record.as_bytes()).hexdigest()
+    change_card(folder, lambda card: card["training"].update({TRAINED_ON_SHA256: sha256}))
+    assert read_trained_on(folder, read_card(folder)) == record
+    TrainedOn(frozenset(["0" * 64])).write(folder)
+    with pytest.raises(IntegrityError, match=r"trained_on\.txt has changed"):
+        read_trained_on(folder, read_card(folder))
+    (folder / TRAINED_ON).unlink()
+    with pytest.raises(DataError, match=r"trained_on\.txt is missing"):
+        read_trained_on(folder, read_card(folder))

@@ -13,13 +13,14 @@ from small_base import adapted, perturbed
 
 from weather_aug.clip.images import resized_label
 from weather_aug.clip.types import Camera, Frame, FrameKey
-from weather_aug.edit.background import BackgroundEditor, Moment
+from weather_aug.edit.background import BackgroundEditor, Moment, RecordedEditor
 from weather_aug.edit.diffusion.adapter_files import save_adapter
 from weather_aug.edit.diffusion.editor import (
     DiffusionEditor,
     SingleStyleEditors,
     effective_weights,
 )
+from weather_aug.edit.diffusion.leakage import TrainedOn
 from weather_aug.edit.diffusion.options import (
     RELEASE_WEIGHTS,
     SELF_ONLY,
@@ -32,6 +33,7 @@ from weather_aug.edit.diffusion.spec import PROMPTS, AdapterSpec
 from weather_aug.errors import ArgumentError, DataError
 
 WIDTH, HEIGHT = 43, 29
+RECORD = TrainedOn(frozenset(["0" * 64]))
 
 
 def frame(time: int, camera: str = "front", yaw: float = 0.0, height: int = HEIGHT) -> Frame:
@@ -182,9 +184,12 @@ def test_single_styles_are_one_editor(small_base: Path, tmp_path: Path) -> None:
         spec = AdapterSpec(prompts={style: PROMPTS[style]}, unet_rank=2)
         model = perturbed(adapted(small_base, spec), seed)
         save_adapter(model, tmp_path / "singles" / style)
+    RECORD.write(tmp_path / "singles" / "snow")
     options = DiffusionOptions(str(small_base), tmp_path / "singles", attention=SELF_ONLY)
     editor = DiffusionEditor.load(options)
     assert isinstance(editor, SingleStyleEditors) and isinstance(editor, BackgroundEditor)
+    assert isinstance(editor, RecordedEditor)
+    assert editor.trained_on("snow") == RECORD and editor.trained_on("rain") is None
     assert editor.styles == ("rain", "snow")
     moment = Moment((frame(1),))
     alone = DiffusionEditor.load(replace(options, adapter=tmp_path / "singles" / "snow"))

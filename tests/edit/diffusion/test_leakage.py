@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +29,7 @@ from weather_aug.edit.diffusion.leakage import (
     without_leaks,
 )
 from weather_aug.edit.diffusion.pairs import PairList
-from weather_aug.errors import ArgumentError, DataError, OutputError
+from weather_aug.errors import ArgumentError, DataError, IntegrityError, OutputError
 
 
 @pytest.fixture
@@ -221,6 +224,35 @@ def test_places_are_pictures_or_folders_of_them(tmp_path: Path) -> None:
         list(digests_by_path(pictures_in([tmp_path / "set"])))
 
 
+def test_linked_folders_are_followed_and_entered_once(tmp_path: Path) -> None:
+    """Validation sets are often put together of links; one that is skipped would look clean."""
+    one, two = save(tmp_path / "disk/fog/one.png"), save(tmp_path / "disk/rain/two.png")
+    (tmp_path / "val").mkdir()
+    (tmp_path / "val/fog").symlink_to(one.parent)
+    (tmp_path / "val/rain.png").symlink_to(two)
+    (tmp_path / "disk/fog/round").symlink_to(tmp_path / "disk")
+    found = list(pictures_in([tmp_path / "val"]))
+    assert found == sorted(found) and {path.resolve() for path in found} == {one, two}
+    assert sum(path.resolve() == one for path in found) == 1
+
+
+def test_a_folder_that_cannot_be_listed_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save(tmp_path / "val/one.png")
+    (tmp_path / "val/closed").mkdir()
+    real = os.scandir
+
+    def scandir(path: Any) -> Any:
+        if str(path).endswith("closed"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return real(path)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    with pytest.raises(DataError, match="closed: Permission denied"):
+        list(pictures_in([tmp_path / "val"]))
+
+
 def test_an_adapter_knows_what_it_was_trained_on(clean: PairList, tmp_path: Path) -> None:
     trained = TrainedOn.of(clean)
     trained.write(tmp_path)
@@ -259,10 +291,12 @@ LOW, HIGH = "0" * 64, "1" * 64
         (f"{HEADER}\n{LOW}\n\n{HIGH}\n", "line 3 must be 64"),
         (f"{HEADER}\n{LOW[:-1]}g\n", "line 2 must be 64"),
         (f"{HEADER}\n{LOW}\ufeff\n", "not ASCII"),
+        (f"{HEADER}\n{LOW}", "no record"),
+        (f"{HEADER}\r\n{LOW}\r\n", "no record"),
     ],
 )
 def test_a_damaged_record_is_refused(tmp_path: Path, text: str, said: str) -> None:
-    (tmp_path / TRAINED_ON).write_text(text, encoding="utf-8")
+    (tmp_path / TRAINED_ON).write_bytes(text.encode())
     with pytest.raises(DataError, match=said):
         TrainedOn.read(tmp_path)
 
@@ -290,3 +324,21 @@ def test_grey_and_palette_pictures_are_known_by_their_colours(tmp_path: Path) ->
     two = save(tmp_path / "rgb.png", np.stack([grey] * 3, axis=-1))
     assert digests_of(one).pixels == digests_of(two).pixels
     assert digests_of(one).file != digests_of(two).file
+
+
+def test_equal_records_have_equal_bytes_and_their_digest_is_compared(tmp_path: Path) -> None:
+    one, two = TrainedOn(frozenset([LOW])), TrainedOn(frozenset([HIGH, LOW]))
+    assert TrainedOn.union([one, two, one]) == two
+    assert TrainedOn.union([TrainedOn(frozenset([HIGH])), one]).as_bytes() == two.as_bytes()
+    with pytest.raises(ArgumentError, match="empty"):
+        TrainedOn.union([])
+    two.write(tmp_path)
+    path = tmp_path / TRAINED_ON
+    assert path.read_bytes() == two.as_bytes()
+    noted = hashlib.sha256(two.as_bytes()).hexdigest()
+    assert TrainedOn.read_file(path, noted) == two
+    # Still a record, of another picture.
+    path.write_bytes(two.as_bytes().replace(HIGH.encode(), HIGH[:-1].encode() + b"2"))
+    assert TrainedOn.read_file(path) != two
+    with pytest.raises(IntegrityError, match=r"trained_on\.txt has changed"):
+        TrainedOn.read_file(path, noted)

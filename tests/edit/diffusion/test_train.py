@@ -22,7 +22,14 @@ from pair_folder import write_pair_folder
 from weather_aug import _files
 from weather_aug.edit.diffusion import learner as learner_module
 from weather_aug.edit.diffusion import train, train_state
-from weather_aug.edit.diffusion.adapter_files import CARD, WEIGHTS, load_adapter, read_card
+from weather_aug.edit.diffusion.adapter_files import (
+    CARD,
+    TRAINED_ON_SHA256,
+    WEIGHTS,
+    load_adapter,
+    read_card,
+    read_trained_on,
+)
 from weather_aug.edit.diffusion.base import load_base
 from weather_aug.edit.diffusion.leakage import TRAINED_ON, TrainedOn
 from weather_aug.edit.diffusion.learner import Learner
@@ -124,7 +131,9 @@ def test_what_is_made(made: Made) -> None:
     assert max(float(tensor.abs().max()) for tensor in model.trained().values()) > 0
 
     root = made.pairs.parent
-    trained_on = TrainedOn.read(folder)
+    trained_on = read_trained_on(folder, card)
+    assert trained_on is not None and trained_on == TrainedOn.read(folder)
+    assert told[TRAINED_ON_SHA256] == _files.sha256_of_file(folder / TRAINED_ON)
     assert trained_on.overlap([root / "snow_0.png"]) == [root / "snow_0.png"]
     assert trained_on.overlap([root / "snow_1.png", root / "clear_1.png"]) == []
 

@@ -4,7 +4,8 @@ Files:
     adapter.safetensors: every trained tensor by its name in `AdaptedModel`, float32.
     card.json: spec, base (id, revision, digest), licence, how it was trained, and the size and
         digest of the tensors; written last.
-    trained_on.txt: digests of all pictures it was trained on, where training wrote it.
+    trained_on.txt: digests of all pictures it was trained on, where training wrote it; the card
+        has its SHA-256.
 """
 
 from __future__ import annotations
@@ -21,12 +22,15 @@ from weather_aug import _files
 from weather_aug._extras import require
 from weather_aug.edit.diffusion.adapted import AdaptedModel
 from weather_aug.edit.diffusion.base import TO, Base
+from weather_aug.edit.diffusion.leakage import TRAINED_ON, TrainedOn
 from weather_aug.edit.diffusion.spec import AdapterSpec, parse_spec
 from weather_aug.errors import ArgumentError, DataError, IntegrityError, printable
 
 FORMAT = "weather_aug adapter"
 VERSION = 1
 WEIGHTS, CARD = "adapter.safetensors", "card.json"
+TRAINED_ON_SHA256 = "trained_on_sha256"
+"""Of the record, among what a card says of the training."""
 DEFAULT_LICENCE = "that of the base model, and of the pictures that it was trained on"
 
 
@@ -124,6 +128,24 @@ def read_card(folder: Path) -> Card:
         raise DataError(
             f"{printable(path, 200)} is malformed: {type(error).__name__} {printable(error)}"
         ) from None
+
+
+def read_trained_on(folder: Path, card: Card) -> TrainedOn | None:
+    """What an adapter was trained on; None where nobody recorded it.
+
+    Raises:
+        DataError: If the record is malformed, or the card names one and it is not there.
+        IntegrityError: If it is another one than the card names.
+    """
+    path, sha256 = folder / TRAINED_ON, card.training.get(TRAINED_ON_SHA256)
+    if path.exists():
+        return TrainedOn.read_file(path, sha256)
+    if sha256 is None:
+        return None
+    raise DataError(
+        f"{printable(path, 200)} is missing, which tells what the adapter was trained on; get it "
+        "from where the adapter is from"
+    )
 
 
 def load_adapter(folder: Path, base: Base, *, other_base: bool = False) -> AdaptedModel:

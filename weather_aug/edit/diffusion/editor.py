@@ -20,9 +20,16 @@ from weather_aug.clip.types import Frame
 from weather_aug.edit.background import STYLES, Moment
 from weather_aug.edit.devices import device_of
 from weather_aug.edit.diffusion.adapted import AdaptedModel
-from weather_aug.edit.diffusion.adapter_files import CARD, Card, load_adapter, read_card
+from weather_aug.edit.diffusion.adapter_files import (
+    CARD,
+    Card,
+    load_adapter,
+    read_card,
+    read_trained_on,
+)
 from weather_aug.edit.diffusion.attention import temporal_view
 from weather_aug.edit.diffusion.base import load_base
+from weather_aug.edit.diffusion.leakage import TrainedOn
 from weather_aug.edit.diffusion.options import AttentionWeights, DiffusionOptions
 from weather_aug.edit.diffusion.references import Links, view_references, window_links
 from weather_aug.edit.diffusion.skips import Encoded
@@ -48,12 +55,19 @@ class DiffusionEditor:
         model: Base and adapter.
         options: How it is run.
         card: Of the adapter.
+        trained_on: What the adapter was trained on, None where nobody recorded it.
     """
 
     name = "diffusion"
 
-    def __init__(self, model: AdaptedModel, options: DiffusionOptions, card: Card) -> None:
-        self.options, self._card = options, card
+    def __init__(
+        self,
+        model: AdaptedModel,
+        options: DiffusionOptions,
+        card: Card,
+        trained_on: TrainedOn | None = None,
+    ) -> None:
+        self.options, self._card, self._trained_on = options, card, trained_on
         dtype = torch.float16 if options.half else torch.float32
         self.model = model.to(device_of(options.device), dtype)
         self.attention = effective_weights(options)
@@ -69,8 +83,10 @@ class DiffusionEditor:
 
         Raises:
             ArgumentError: If no adapter is given, or the device is not there.
-            DataError: If base or adapter cannot be read or do not belong together.
-            IntegrityError: If the adapter's weights are not those that it was saved with.
+            DataError: If base or adapter cannot be read or do not belong together, or the record
+                of what the adapter was trained on is missing or none.
+            IntegrityError: If the adapter's weights, or that record, are not those that it was
+                saved with.
             MissingExtraError: If diffusers or peft are not installed.
         """
         if options.adapter is None:
@@ -90,8 +106,9 @@ class DiffusionEditor:
     @classmethod
     def _of(cls, folder: Path, options: DiffusionOptions) -> DiffusionEditor:
         card = read_card(folder)
+        trained_on = read_trained_on(folder, card)
         model = load_adapter(folder, load_base(options.base), other_base=options.other_base)
-        return cls(model, options, card)
+        return cls(model, options, card, trained_on)
 
     @property
     def styles(self) -> tuple[str, ...]:
@@ -116,6 +133,10 @@ class DiffusionEditor:
             "half": self.options.half,
             "torch": torch.__version__,
         }
+
+    def trained_on(self, style: str) -> TrainedOn | None:
+        """What the adapter was trained on; its styles share parts, so it is one for all."""
+        return self._trained_on
 
     def edit(self, moment: Moment, style: str | Mapping[str, float]) -> tuple[UInt8, ...]:
         """The frames of now in a style, or in a blend of the adapter's styles.
@@ -253,6 +274,10 @@ class SingleStyleEditors:
     def card(self) -> Mapping[str, Any]:
         """The card of each adapter."""
         return {"editor": self.name, "single": {k: dict(e.card) for k, e in self.editors.items()}}
+
+    def trained_on(self, style: str) -> TrainedOn | None:
+        """What the adapter of a style was trained on."""
+        return self.editors[style].trained_on(style)
 
     def edit(self, moment: Moment, style: str) -> tuple[UInt8, ...]:
         """The frames of now in a style; see `DiffusionEditor.edit`."""

@@ -22,7 +22,7 @@ from tqdm.auto import tqdm
 from weather_aug import _files
 from weather_aug.clip.images import read_image
 from weather_aug.edit.diffusion.pairs import Pair, PairList, check_digest
-from weather_aug.errors import ArgumentError, DataError, printable
+from weather_aug.errors import ArgumentError, DataError, IntegrityError, printable
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
 TRAINED_ON = "trained_on.txt"
@@ -73,12 +73,15 @@ def digests_by_path(
 def pictures_in(places: Iterable[Path]) -> Iterator[Path]:
     """The files given, and the PNG and JPEG files below the folders given, by name.
 
+    Links to folders are followed: data sets are often put together of them.
+
     Raises:
-        DataError: If a place is neither file nor folder, or a folder holds no picture.
+        DataError: If a place is neither file nor folder, or a folder holds no picture or cannot be
+            read.
     """
     for place in places:
         if place.is_dir():
-            below = sorted(filter(_is_picture, place.rglob("*")))
+            below = sorted(filter(_is_picture, _paths_below(place)))
             if not below:
                 raise DataError(f"{printable(place, 200)} holds no PNG or JPEG; check the folder")
             yield from below
@@ -179,24 +182,57 @@ class TrainedOn:
         return cls(frozenset(d for pair in pairs for d in _digests_of_pair(pair)))
 
     @classmethod
+    def union(cls, records: Iterable[TrainedOn]) -> TrainedOn:
+        """What several were trained on, as one record.
+
+        Raises:
+            ArgumentError: If there is none.
+        """
+        return cls(frozenset[str]().union(*(record.digests for record in records)))
+
+    @classmethod
     def read(cls, folder: Path) -> TrainedOn:
         """Read the record that stands beside an adapter.
 
         Raises:
             DataError: If there is none, or a line is no digest or out of order.
         """
-        path = folder / TRAINED_ON
+        return cls.read_file(folder / TRAINED_ON)
+
+    @classmethod
+    def read_file(cls, path: Path, sha256: str | None = None) -> TrainedOn:
+        """Read a record.
+
+        Args:
+            path: Of its file.
+            sha256: Of its bytes, where somebody noted it; not compared if None.
+
+        Raises:
+            DataError: If there is none, or a line is no digest or out of order.
+            IntegrityError: If it has other bytes.
+        """
         try:
             if path.stat().st_size > MAX_TRAINED_ON_BYTES:
                 raise DataError(
                     f"{printable(path, 200)} is larger than {MAX_TRAINED_ON_BYTES} bytes"
                 )
-            lines = path.read_text(encoding="ascii").splitlines()
-        except UnicodeDecodeError:
-            raise DataError(f"{printable(path, 200)} is not ASCII text") from None
+            data = path.read_bytes()
         except OSError as error:
             raise DataError(f"cannot read {printable(path, 200)}: {error.strerror}") from None
-        if lines[:1] != [TRAINED_ON_HEADER] or len(lines) < 2:
+        return cls.parse(data, str(path), sha256)
+
+    @classmethod
+    def parse(cls, data: bytes, path: str, sha256: str | None = None) -> TrainedOn:
+        """A record's bytes as a record; `path` is named in errors. See `read_file`."""
+        if sha256 not in (None, _files.sha256_of(data)):
+            raise IntegrityError(
+                f"{printable(path, 200)} has changed since it was written; take the file as it was"
+            )
+        try:
+            *lines, end = data.decode("ascii").split("\n")
+        except UnicodeDecodeError:
+            raise DataError(f"{printable(path, 200)} is not ASCII text") from None
+        if lines[:1] != [TRAINED_ON_HEADER] or len(lines) < 2 or end:
             raise DataError(f"{printable(path, 200)} is no record of what an editor was trained on")
         before = ""
         for number, line in enumerate(lines[1:], 2):
@@ -216,8 +252,11 @@ class TrainedOn:
         Raises:
             OutputError: If it cannot be written.
         """
-        text = "\n".join([TRAINED_ON_HEADER, *sorted(self.digests)]) + "\n"
-        _files.write_whole(folder / TRAINED_ON, text.encode("ascii"))
+        _files.write_whole(folder / TRAINED_ON, self.as_bytes())
+
+    def as_bytes(self) -> bytes:
+        """The record's file: equal records have equal bytes."""
+        return ("\n".join([TRAINED_ON_HEADER, *sorted(self.digests)]) + "\n").encode("ascii")
 
     def overlap(self, places: Path | Iterable[Path]) -> list[Path]:
         """Pictures of an evaluation set that the editor has seen.
@@ -231,6 +270,23 @@ class TrainedOn:
         given = [places] if isinstance(places, Path) else places
         found = digests_by_path(pictures_in(given))
         return [path for path, digests in found if not self.digests.isdisjoint(digests)]
+
+
+def _paths_below(place: Path) -> Iterator[Path]:
+    """Every file, also in folders that are linked to, each of which is entered once."""
+
+    def refuse(error: OSError) -> None:
+        raise DataError(f"cannot read {printable(error.filename, 200)}: {error.strerror}")
+
+    entered: set[Path] = set()
+    for folder, below, names in os.walk(place, onerror=refuse, followlinks=True):
+        real = Path(folder).resolve()
+        if real in entered:
+            below.clear()
+            continue
+        entered.add(real)
+        below.sort()
+        yield from (Path(folder, name) for name in names)
 
 
 def _is_picture(path: Path) -> bool:

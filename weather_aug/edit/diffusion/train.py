@@ -16,7 +16,7 @@ from weather_aug import _files
 from weather_aug._extras import require
 from weather_aug._png import png_bytes
 from weather_aug.edit.diffusion import samples, train_state
-from weather_aug.edit.diffusion.adapter_files import save_adapter
+from weather_aug.edit.diffusion.adapter_files import TRAINED_ON_SHA256, save_adapter
 from weather_aug.edit.diffusion.base import Base, load_base
 from weather_aug.edit.diffusion.leakage import TrainedOn
 from weather_aug.edit.diffusion.learner import Learner
@@ -204,7 +204,8 @@ class _Training:
             for entry in train_state.read_log(self.work)
             if "validation" in entry
         ]
-        TrainedOn.of(self.pair_list).write(self.work)
+        trained_on = TrainedOn.of(self.pair_list)
+        trained_on.write(self.work)
         save_adapter(
             self.learner.model,
             self.work,
@@ -215,6 +216,7 @@ class _Training:
                 "pair_list": self.pair_list.name,
                 "pairs_sha256": digest_of_pairs(self.pair_list),
                 "pairs": counts_of(self.pair_list),
+                TRAINED_ON_SHA256: _files.sha256_of(trained_on.as_bytes()),
                 "validation": validations[-1] if validations else {},
                 "torch": torch.__version__,
             },

@@ -166,6 +166,8 @@ def publish(work: Path, out: Path) -> None:
     """
     with _files.reported(out):
         (work / STATE).unlink(missing_ok=True)
+        for folder in (work, work / SAMPLES):
+            _files.remove_temporaries(folder)
         work.rename(out)
         _files.sync_folder(out.parent)
 
@@ -277,9 +279,10 @@ def _differences(old: Any, new: Any, where: str) -> Iterator[str]:
 
 def _refuse_strange(work: Path) -> None:
     """Nothing that was not made here is removed."""
-    ours = {JOB, LOG, STATE, SAMPLES, CARD, WEIGHTS, TRAINED_ON}
+    ours = {JOB, LOG, STATE, STATE + _files.TEMPORARY_SUFFIX, SAMPLES, CARD, WEIGHTS, TRAINED_ON}
+    _files.remove_temporaries(work)
     for path in work.iterdir():
-        if path.name.removesuffix(_files.TEMPORARY_SUFFIX) not in ours:
+        if path.name not in ours:
             raise ConflictError(
                 f"{printable(work, 200)} exists and is no unfinished training (no {JOB}); move it "
                 "elsewhere"

@@ -15,7 +15,7 @@ from weather_aug._rows import encode_row, survival
 from weather_aug.edit.physical.buffer import BELOW_TOP, FREE, GROUNDED, LUMA, ROWS, SKYNESS, B, G, R
 from weather_aug.edit.physical.ground_rows import ground_run
 from weather_aug.edit.physical.layer_rows import load_row
-from weather_aug.edit.physical.layers import GROUND_GAIN, MATTE
+from weather_aug.edit.physical.layers import GROUND_GAIN, MATTE, OBJECT_GAIN
 from weather_aug.edit.physical.materials import CAP_M, COVER, GROUND, LEAF, POROSITY
 from weather_aug.edit.physical.noise_rows import KNOT_PX, knots_across, noise_row
 from weather_aug.edit.physical.relight import LEAST_GAIN, MOST_GAIN, SKY_FEATURE
@@ -132,7 +132,7 @@ def dress(
         _tone(look.exposure, matrix, width, b)
         if snowy or pools:
             noise_row(
-                *(surface, classes, y, left, width, geometry, table, tile),
+                *(surface, classes, kinds, y, left, width, geometry, table, tile),
                 *((snowy, pools), knots, knot_depth, b),
             )
         if snowy or wet:
@@ -208,9 +208,22 @@ def _flatten(kinds, table, small, cell, share, look, tint, width, b):
     """The sun's light and shadow go."""
     zero = np.float32(0.0)
     least, most = OBJECT_GAINS
+    start, end = np.uint64(0), np.uint64(width)
+    grounded = zero
     for x in range(width):
         b[GROUNDED, x] = table[kinds[x], GROUND]
-    spread_run(small, GROUND_GAIN, 6, cell, share, np.uint64(0), np.uint64(width), b, FREE)
+        grounded = max(grounded, b[GROUNDED, x])
+    spread_run(small, OBJECT_GAIN, 2, cell, share, start, end, b, FREE + 4)
+    if grounded == zero:
+        # Half of all rows; without ground no channel differs.
+        for x in range(width):
+            other = b[FREE + 4, x] * b[LUMA, x] + b[FREE + 5, x]
+            gain = survival(-(look.flattening * min(max(other, least), most)))
+            b[R, x] *= gain
+            b[G, x] *= gain
+            b[B, x] *= gain
+        return
+    spread_run(small, GROUND_GAIN, 4, cell, share, start, end, b, FREE)
     for x in range(width):
         ground = b[FREE, x] * b[LUMA, x] + b[FREE + 1, x]
         ground = min(max(ground, b[FREE + 2, x]), b[FREE + 3, x])

@@ -11,7 +11,7 @@ import numpy as np
 
 from weather_aug._compiled import compiled
 from weather_aug.edit.physical.buffer import LIE, NOISE
-from weather_aug.edit.physical.materials import GROUND
+from weather_aug.edit.physical.materials import COVER, GROUND, ROAD
 from weather_aug.edit.physical.noise import ground_noise
 from weather_aug.edit.surface import depth_row
 
@@ -32,12 +32,15 @@ def knots_across(left, width, whole_width):
 
 
 @compiled
-def noise_row(surface, classes, y, left, width, geometry, table, tile, wanted, knots, depth, b):
-    """Noise of one row's places, and the water's where `pools`.
+def noise_row(
+    surface, classes, kinds, y, left, width, geometry, table, tile, wanted, knots, depth, b
+):
+    """Noise of one row's places where snow can lie, and the water's on the road.
 
     Args:
         surface: The recorded picture.
         classes: (N,) train ids of the whole picture.
+        kinds: (W,) of the row.
         y: Row of the picture.
         left: Column of the window's first pixel.
         width: Of the window.
@@ -47,7 +50,7 @@ def noise_row(surface, classes, y, left, width, geometry, table, tile, wanted, k
         wanted: (snow's, water's) noise.
         knots: (2, K) float32 scratch.
         depth: (>= 4 K) float32 scratch.
-        b: Buffer; fills NOISE, with 1/2 if it is not wanted, and LIE.
+        b: Buffer; fills NOISE, with 1/2 where it is not wanted, and LIE if it is wanted.
     """
     snow, pools = wanted
     count, first = knots_across(left, width, surface.width)
@@ -61,6 +64,16 @@ def noise_row(surface, classes, y, left, width, geometry, table, tile, wanted, k
     across = np.float32(1.0) + ray_y * ray_y
     start = y * surface.width + first
     for k in range(count):
+        knots[0, k] = knots[1, k] = np.float32(0.5)
+    # A knot that nobody asks for holds 1/2 until then; one that is asked for, more than that.
+    if snow:
+        _ask(kinds, table, COVER, left - first, knots[0])
+    if pools:
+        _ask(kinds, table, ROAD, left - first, knots[1])
+    for k in range(count):
+        asked = (knots[0, k] > np.float32(0.5), knots[1, k] > np.float32(0.5))
+        if not (asked[0] or asked[1]):
+            continue
         x = min(np.int32(k * KNOT_PX), np.int32(wide - 1))
         z = row_depth[x]
         if not z < np.float32(FARTHEST_M):
@@ -79,14 +92,22 @@ def noise_row(surface, classes, y, left, width, geometry, table, tile, wanted, k
             along += slope
             aside += slope
             size *= np.float32(KNOT_PX)
-        knots[0, k] = np.float32(0.5)
-        if snow:
+        if asked[0]:
             knots[0, k] = ground_noise(tile, along, aside, size, np.float32(0.0))
-        if pools:
+        if asked[1]:
             knots[1, k] = ground_noise(tile, along, aside, size, np.float32(OTHER_M))
     _between(knots, 0, left - first, width, b, NOISE)
     if pools:
         _between(knots, 1, left - first, width, b, LIE)
+
+
+@compiled
+def _ask(kinds, table, column, offset, knots):
+    """Set the knots on both sides of pixels whose class has something in a column of the table."""
+    for x in range(kinds.shape[0]):
+        if table[kinds[x], column] > np.float32(0.0):
+            k = (offset + x) // KNOT_PX
+            knots[k] = knots[k + 1] = np.float32(1.0)
 
 
 @compiled

@@ -28,6 +28,9 @@ def ripple(run, depth, geometry, look, b):
     ray_y = (y - geometry.cy) / geometry.fy
     along_y = geometry.along_y * ray_y + geometry.along_z
     left_y = geometry.left_y * ray_y + geometry.left_z
+    per_cell = np.float32(1.0 / CELL_M)
+    known_i = known_j = np.float32(np.nan)
+    rings, centre_u, centre_v, age = False, zero, zero, zero
     for x in range(x0, x1):
         if b[SIZE, x] >= np.float32(COARSEST_M):
             continue
@@ -35,8 +38,15 @@ def ripple(run, depth, geometry, look, b):
         ray_x = (left + np.float32(x) - geometry.cx) / geometry.fx
         along = geometry.along_0 + z * (geometry.along_x * ray_x + along_y)
         aside = geometry.left_0 + z * (geometry.left_x * ray_x + left_y)
+        i, j = np.floor(along * per_cell), np.floor(aside * per_cell)
+        # Near the camera many pixels of a row lie in one cell.
+        if i != known_i or j != known_j:
+            known_i, known_j = i, j
+            rings, centre_u, centre_v, age = _ring(i, j, look)
+        if not rings:
+            continue
         fine = one - b[SIZE, x] * np.float32(1.0 / COARSEST_M)
-        wave = _ring(along, aside, look) * fine
+        wave = _height(along - centre_u, aside - centre_v, age) * fine
         deep = np.float32(ON_FILM) + b[POOL, x] * np.float32(ON_POOL - ON_FILM)
         change = max(one + deep * wave, zero)
         for k in range(6):
@@ -44,23 +54,24 @@ def ripple(run, depth, geometry, look, b):
 
 
 @inlined
-def _ring(along, aside, look):
-    """Height of the cell's ring at a place, in [-1, 1]; each cell has its own beat."""
-    one, per_cell = np.float32(1.0), np.float32(1.0 / CELL_M)
-    i, j = np.floor(along * per_cell), np.floor(aside * per_cell)
-    cell = _hashed(np.uint32(np.int32(i)), np.uint32(np.int32(j)), np.uint32(0))
-    beat = look.time_s * np.float32(1.0 / LIFE_S) + _unit(cell)
-    age = beat - np.floor(beat)
-    word = _hashed(
-        np.uint32(np.int32(i)), np.uint32(np.int32(j)), np.uint32(np.int32(np.floor(beat)))
-    )
-    if _unit(word) >= look.ripples:
-        return np.float32(0.0)
+def _ring(i, j, look):
+    """Whether a cell has a ring, its centre in metres, and its age in lives; cells beat alone."""
+    row, column = np.uint32(np.int32(i)), np.uint32(np.int32(j))
+    beat = look.time_s * np.float32(1.0 / LIFE_S) + _unit(_hashed(row, column, np.uint32(0)))
+    whole = np.floor(beat)
+    word = _hashed(row, column, np.uint32(np.int32(whole)))
+    rings = _unit(word) < look.ripples
     word = _mixed(word + np.uint32(0x9E3779B9))
     centre_u = np.float32(0.3) + np.float32(0.4) * _unit(word)
     centre_v = np.float32(0.3) + np.float32(0.4) * _unit(_mixed(word))
-    du = along - (i + centre_u) * np.float32(CELL_M)
-    dv = aside - (j + centre_v) * np.float32(CELL_M)
+    size = np.float32(CELL_M)
+    return rings, (i + centre_u) * size, (j + centre_v) * size, beat - whole
+
+
+@inlined
+def _height(du, dv, age):
+    """Height of a ring, in [-1, 1], so many metres from its centre."""
+    one = np.float32(1.0)
     off = np.sqrt(du * du + dv * dv) - np.float32(SPEED_M_PER_S * LIFE_S) * age
     phase = off * np.float32(1.0 / WAVE_M)
     if abs(phase) >= one:

@@ -109,11 +109,11 @@ def report(counts: dict[str, list[Any]], weathered: str) -> str:
     for a, b in pairs + [(arm, arm + ALONE) for arm in rows]:
         if a != b and {a, b} <= counts.keys():
             rows[f"{a} - {b}"] = rows[a] - rows[b]
-    lines = [f"{'mIoU':34}{'clear':27}weathered"]
+    lines = [f"{'mIoU':44}{'clear':27}weathered"]
     for name, both in rows.items():
         limits = np.percentile(both[:, 1:], (2.5, 97.5), axis=1)
         parts = map("{:7.3f} [{:6.3f}, {:6.3f}]".format, both[:, 0], *limits)
-        lines.append(f"{name:32}" + "   ".join(parts))
+        lines.append(f"{name:42}" + "   ".join(parts))
     return "\n".join([*lines, NOTE.format(weathered)])
 
 

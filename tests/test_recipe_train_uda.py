@@ -534,7 +534,7 @@ def test_arms_and_seeds_end_in_other_weights(roles, tmp_path):
 def test_a_state_of_another_method_is_refused(roles, tmp_path):
     """Else a run with another threshold would hand back the old one's numbers."""
     trained(roles, tmp_path / "a" / "state")
-    with pytest.raises(ConflictError, match=r"confident=0\.5.*another --out"):
+    with pytest.raises(ConflictError, match=r"confident=0\.8.*another --out"):
         trained(roles, tmp_path / "a" / "state", confident=0.968)
 
 

@@ -32,7 +32,7 @@ DETAIL_WEIGHT, HIDDEN = 0.1, 0.7  # HRDA: of a detail's loss. MIC: of the blocks
 class Method:  # noqa: D101 (comments are the help)
     iterations: int = 200  # Steps of each training.
     alone: int = 100  # First steps, on the source alone. Trainers: 0, as their nets know ImageNet.
-    confident: float = 0.5  # From here on the teacher is sure. Trainers: 0.968, of better nets.
+    confident: float = 0.8  # From here on the teacher is sure. Trainers: 0.968, of better nets.
     average: float = 0.95  # Of the teacher, at most. Trainers: 0.999, 1,000 of their 40,000 steps.
     rate: float = 3e-3  # Of AdamW. Trainers: 6e-5, for weights that have seen ImageNet.
     spread: float = 0.1  # Of the first weights; usual is 0.02, from which it takes more steps.

@@ -9,7 +9,7 @@ from render_scene import make_camera
 
 from weather_aug.clip.types import FrameKey
 from weather_aug.render import sensor
-from weather_aug.render.compression import BLOCK_PX, compress, steps_of
+from weather_aug.render.compression import BLOCK_PX, STRIP_PX, compress, steps_of
 from weather_aug.render.sensor import exposed
 from weather_aug.weather import Weather
 
@@ -81,7 +81,7 @@ def test_blocks_know_nothing_of_each_other():
 
 
 def test_an_even_block_stays_even():
-    strip = np.full((3, BLOCK_PX, 24), 77, np.uint8)
+    strip = np.full((3, BLOCK_PX, STRIP_PX), 77, np.uint8)
     compress(strip.view(np.uint64), steps_of(80))
     assert (strip == strip[:, :1, :1]).all()
     assert abs(int(strip[0, 0, 0]) - 77) <= 2

@@ -251,7 +251,8 @@ def _trimmed(
     """Labels from the outer window, then everything cut to the inner one."""
     through, covered = shot.transmittance, shot.covered
     if glass is not None:
-        through = through * (np.float32(1.0) - glass.alpha)
+        through = np.float32(1.0) - glass.alpha
+        through *= shot.transmittance
         covered = covered | glass.hidden
     part = _part((window[0] - outer[0], window[1] - outer[1], *window[2:]))
     cut = np.ascontiguousarray

@@ -25,6 +25,8 @@ BLOCK_PX = 8
 _LANES = 16
 """Blocks side by side that are worked on together: as many as a vector of the widest machine."""
 _COLUMN = BLOCK_PX * _LANES
+STRIP_PX = BLOCK_PX * _LANES
+"""Width of the blocks that are worked on together."""
 
 # Steps of quality 50 for brightness and for colour, ITU-T T.81, tables K.1 and K.2.
 _BRIGHTNESS = (
@@ -88,10 +90,10 @@ def compress(words: Any, steps: Any) -> None:
     vector by shifts alone.
 
     Args:
-        words: (3, 8, W / 8) uint64: red, green and blue levels, the first pixel in the lowest byte.
+        words: (3, 8, W / 8) uint64: red, green and blue levels, the first pixel in the lowest byte;
+            W a multiple of 128.
         steps: (3, 8, 8) float32, see `steps_of`.
     """
-    wide = words.shape[2]
     # Place (x, y) of block b is at x * _COLUMN + y * _LANES + b.
     blocks = np.empty((3, BLOCK_PX * _COLUMN), np.int32)
     some = np.zeros((BLOCK_PX, _LANES), np.uint64)
@@ -100,11 +102,10 @@ def compress(words: Any, steps: Any) -> None:
     for channel in range(3):
         lanes[channel] = np.repeat(steps[channel].reshape(-1), _LANES)
         shares[channel] = np.float32(0.125) / lanes[channel]
-    for left in range(0, wide, _LANES):
-        count = min(_LANES, wide - left)
+    for left in range(0, words.shape[2], _LANES):
         for channel in range(3):
             for y in range(BLOCK_PX):
-                for b in range(count):
+                for b in range(_LANES):
                     some[y, b] = words[channel, y, left + b]
             _unpack(some.reshape(-1), blocks[channel])
         _turn(blocks[0], blocks[1], blocks[2])
@@ -114,7 +115,7 @@ def compress(words: Any, steps: Any) -> None:
         for channel in range(3):
             _pack(blocks[channel], some.reshape(-1))
             for y in range(BLOCK_PX):
-                for b in range(count):
+                for b in range(_LANES):
                     words[channel, y, left + b] = some[y, b]
 
 

@@ -79,15 +79,15 @@ def readable_labels(
     near = np.ones((NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX), np.uint8)
     limits = (HAZY_TRANSMITTANCE, DOUBTFUL_TRANSMITTANCE, LEAST_TRANSMITTANCE)
     if small is None:
-        small = np.ones_like(label)
+        small = np.empty(0, np.uint8)
     unseen, invalid, gone = (np.empty(label.shape, np.uint8) for _ in range(3))
     inputs = (label, air, transmittance, cv2.dilate(distinct, near), covered, small)
-    count = read_labels(
+    read_labels(
         *(np.ascontiguousarray(plane).reshape(-1) for plane in inputs),
         tuple(np.float32(limit) for limit in limits),
         *(plane.reshape(-1) for plane in (unseen, invalid, gone)),
     )
-    if count:
+    if gone.any():
         invalid |= cv2.dilate(gone, near) & (label == SKY)
     return Sight(unseen, invalid)
 
@@ -129,26 +129,20 @@ def read_labels(label, air, through, near_distinct, covered, small, limits, unse
         through: float32 transmittance of air, particles and glass.
         near_distinct: uint8, 1 where something distinct is near.
         covered: uint8, 1 where the surface is hidden.
-        small: uint8, 1 where a thing beyond the optical range is invalid.
+        small: uint8, 1 where a thing beyond the optical range is invalid; (0,) if all are.
         limits: Transmittances below which a surface is hazy, doubtful, hidden.
         unseen: uint8 out, 1 where a surface is hidden or cannot be told from the air.
         invalid: uint8 out, 1 there and where a small surface is beyond the optical range.
         gone: uint8 out, 1 where a surface that somebody labelled cannot be told from the air.
-
-    Returns:
-        Number of surfaces that are gone.
     """
     hazy, doubt, hidden = limits
-    count = np.int64(0)
+    one, zero, any_size = np.uint8(1), np.uint8(0), small.shape[0] == 0
     for i in range(label.shape[0]):
         t = through[i]
         surface = label[i] != np.uint8(SKY)
-        lost = surface & ((t < hidden) | ((air[i] < hazy) & (near_distinct[i] == 0)))
-        doubtful = np.uint8(1) if surface & (t < doubt) else np.uint8(0)
-        blind = np.uint8((np.uint8(1) if lost else np.uint8(0)) | covered[i])
-        unseen[i] = blind
-        invalid[i] = np.uint8(blind | np.uint8(doubtful & small[i]))
-        known = lost & (label[i] != np.uint8(IGNORE))
-        gone[i] = np.uint8(1) if known else np.uint8(0)
-        count += np.int64(1) if known else np.int64(0)
-    return count
+        lost = surface & ((t < hidden) | ((air[i] < hazy) & (near_distinct[i] == zero)))
+        doubtful = surface & (t < doubt) & (any_size or small[i] != zero)
+        blind = lost | (covered[i] != zero)
+        unseen[i] = one if blind else zero
+        invalid[i] = one if blind | doubtful else zero
+        gone[i] = one if lost & (label[i] != np.uint8(IGNORE)) else zero

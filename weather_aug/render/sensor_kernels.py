@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from weather_aug._compiled import compiled, inlined
 from weather_aug._rows import apart_row, encoded, together_row
 from weather_aug.particles.kernels import GOLDEN, mix64
-from weather_aug.render.compression import BLOCK_PX, compress
+from weather_aug.render.compression import BLOCK_PX, STRIP_PX, compress
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
@@ -72,7 +72,7 @@ def expose(
     noise = np.empty((3, wide), np.float32)
     level, deviation = np.empty(wide, np.float32), np.empty(wide, np.float32)
     noisy, veiled = sigma.shape[0] > 0, across.shape[0] > 0
-    strip = np.zeros((3, BLOCK_PX, wide), np.uint8)
+    strip = np.zeros((3, BLOCK_PX, (wide + STRIP_PX - 1) // STRIP_PX * STRIP_PX), np.uint8)
     words = strip.view(np.uint64)
     odd = np.empty(wide, np.bool_)
     for x in range(wide):
@@ -101,7 +101,7 @@ def expose(
             _add_brightness(fine[(v - 1) % 5], fine[v % 5], fine[(v + 1) % 5], noise)
         if noisy or veiled:
             for channel in range(3):
-                levels = strip[channel, k]
+                levels = strip[channel, k, :wide]
                 if veiled:
                     upper, lower = across[rows[y], channel], across[rows[y] + 1, channel]
                     _look_up_row(levels, light, level)

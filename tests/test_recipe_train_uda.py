@@ -5,7 +5,9 @@ import random
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,7 +31,9 @@ from uda import frames, method  # noqa: E402
 
 sys.path.remove(str(RECIPE.parent))
 
-TINY = method.Method(iterations=6, crop_px=64, widths=(8, 8, 16, 16), head=8)
+TINY = method.Method(
+    iterations=6, alone=0, crop_px=64, batch=2, block_px=4, widths=(8, 8, 16, 16), head=8
+)
 
 
 def seeded(seed=0):
@@ -37,12 +41,12 @@ def seeded(seed=0):
 
 
 def batch_of(seed, size=64):
-    """Source, labels with some ignored, target."""
+    """Source, labels with some ignored, target, and the truth about it."""
     generator = seeded(seed)
     pictures = torch.randint(256, (2, 2, 3, size, size), generator=generator, dtype=torch.uint8)
     label = torch.randint(5, (2, size, size), generator=generator)
     label[:, :4] = IGNORE
-    return pictures[0], label, pictures[1]
+    return pictures[0], label, pictures[1], label.flip(0)
 
 
 @pytest.fixture
@@ -70,29 +74,59 @@ def test_networks_are_those_of_their_seed():
     assert torch.equal(state, torch.get_rng_state())
 
 
-class Marked(method.Network):
-    """Context scores are 1, details 2, and attention is sure of what it says."""
+class Features(torch.nn.Module):
+    """An encoder that tells, in place of what it saw, whether it saw the context or details."""
 
-    trusted = 50.0
+    def forward(self, pictures):
+        self.calls = getattr(self, "calls", 0) + 1
+        plane = torch.full((len(pictures), 19, *(n // 4 for n in pictures.shape[-2:])), self.calls)
+        return SimpleNamespace(hidden_states=plane.float())
 
-    def _scores(self, pictures, size, *heads):
-        plane = torch.ones(len(pictures), 19, *size)
-        return [plane, self.trusted * plane] if len(heads) == 2 else [2 * plane]
+
+class Trust(torch.nn.Module):
+    """Attention that is as sure of details everywhere."""
+
+    def __init__(self, trusted):
+        super().__init__()
+        self.trusted = trusted
+
+    def forward(self, features):
+        return torch.full_like(features, self.trusted)
+
+
+def marked(trusted):
+    """Context scores are 1, details 2."""
+    network = method.Network(TINY, 0)
+    network.encoder, network.head = Features(), torch.nn.Identity()
+    network.attention = Trust(trusted)
+    return network
 
 
 @pytest.mark.parametrize(("trusted", "inside"), [(50.0, 2.0), (-50.0, 1.0), (0.0, 1.5)])
 def test_details_are_fused_where_they_are_and_trusted(trusted, inside):
-    network = Marked(TINY, 0)
-    network.trusted = trusted
     box = (slice(8, 24), slice(0, 16))
-    fused, (detail,) = network(torch.zeros(1, 3, 32, 32), [box])
-    assert detail.shape == (1, 19, 16, 16)
+    fused, (detail,) = marked(trusted)(torch.zeros(1, 3, 32, 32), [box])
+    assert detail.shape == (1, 19, 4, 4)
+    assert fused.shape == (1, 19, 8, 8)
     outside = fused.clone()
-    outside[..., box[0], box[1]] = 1
+    outside[..., 2:6, :4] = 1
     assert torch.equal(outside, torch.ones_like(fused))
-    assert torch.allclose(fused[..., *box], torch.tensor(inside))
-    # Boxes over each other are averaged, and the whole is covered, of odd sizes too.
-    assert torch.allclose(network.whole(torch.zeros(1, 3, 31, 45)), torch.tensor(inside))
+    assert torch.allclose(fused[..., 2:6, :4], torch.tensor(inside))
+    # Boxes over each other are averaged, and the whole is covered.
+    whole = marked(trusted).whole(torch.zeros(1, 3, 64, 64))
+    assert whole.shape == (1, 19, 64, 64)
+    assert torch.allclose(whole, torch.tensor(inside))
+
+
+def test_windows_cover_pictures_half_over_each_other():
+    """Sides that no window divides are covered too; a picture of one window's size has one."""
+    times = torch.zeros(80, 112)
+    for box in method.windows((80, 112), 64):
+        assert times[box].shape == (64, 64)
+        times[box] += 1
+    assert times.min() == 1
+    assert len(method.windows((80, 112), 64)) == 2 * 3
+    assert method.windows((64, 64), 64) == [(slice(0, 64), slice(0, 64))]
 
 
 def test_each_head_learns():
@@ -109,12 +143,12 @@ def test_each_head_learns():
 
 
 def test_the_teacher_averages_its_students():
-    """First a copy, then min(1 - 1 / (step + 1), 0.999) of itself, as the trainers have it."""
-    learner = method.Learner(TINY, 0)
+    """First a copy, then min(1 - 1 / (step + 1), average) of itself, as the trainers have it."""
+    learner = method.Learner(replace(TINY, average=0.6), 0)
     expected = None
     for step in range(4):
         student = [p.detach().clone() for p in learner.student.parameters()]
-        kept = min(1 - 1 / (step + 1), 0.999)
+        kept = min(1 - 1 / (step + 1), 0.6)
         old = expected or student
         expected = [kept * a + (1 - kept) * b for a, b in zip(old, student, strict=True)]
         learner.step(step, *batch_of(step))
@@ -127,7 +161,7 @@ def test_the_teacher_averages_its_students():
     learner.teacher.n_averaged.fill_(5000)
     with torch.no_grad():
         old, new = next(learner.teacher.module.parameters()), next(learner.student.parameters())
-        expected = 0.999 * old + 0.001 * new
+        expected = 0.6 * old + 0.4 * new
         learner.teacher.update_parameters(learner.student)
     assert torch.allclose(next(learner.teacher.module.parameters()), expected, atol=1e-7)
 
@@ -148,20 +182,20 @@ def test_half_the_classes_are_pasted():
 
 def mixed_rightly(learner, stood, monkeypatch):
     """Whether a step learns from source pixels with their labels, else with the teacher's."""
-    source, label, target = batch_of(3)
+    source, label, target, hidden = batch_of(3)
     learner.teacher.update_parameters(learner.student)
     learner.teacher.n_averaged.zero_()
     with torch.no_grad():
-        scores = learner.teacher.module.whole(method.normalised(target)).softmax(1)
+        scores = learner.teacher.module.whole(target).softmax(1)
     sure, pseudo = scores.max(1)
     # So sure a teacher is of some pixels, and not of the others.
-    monkeypatch.setattr(method, "CONFIDENT", sure.median().item())
+    learner.method = replace(TINY, confident=sure.median().item())
     pictures = []
     monkeypatch.setattr(
         method, "augmented", lambda arm, mixed, key: pictures.append(mixed) or mixed
     )
     stood.clear()
-    learner.step(0, source, label, target)
+    told = learner.step(0, source, label, target, hidden)
     (mixed,) = pictures
     pasted = (mixed == source).all(1)
     weight = (sure >= sure.median()).float().mean((1, 2), keepdim=True).expand(pseudo.shape)
@@ -175,6 +209,9 @@ def mixed_rightly(learner, stood, monkeypatch):
         and 0.3 < pasted.float().mean() < 0.7
         and torch.equal(truth, torch.where(pasted, label, pseudo))
         and torch.allclose(counts, torch.where(pasted, 1.0, weight))
+        and told["sure"] == pytest.approx(weight.mean().item())
+        and told["right"]
+        == pytest.approx((pseudo == hidden)[hidden != IGNORE].float().mean().item())
     )
 
 
@@ -199,17 +236,19 @@ def test_a_mask_that_is_off_by_a_pixel_is_noticed(stood, monkeypatch):
 
 
 def hidden_share(count=300):
-    masks = torch.stack([method.block_mask(64, seeded(seed)) for seed in range(count)])
+    masks = torch.stack([method.block_mask(64, 4, seeded(seed)) for seed in range(count)])
     blocks = masks.reshape(count, 16, 4, 16, 4)
     assert (blocks == blocks[:, :, :1, :, :1]).all()
-    assert set(masks.unique().tolist()) == {0.0, 1.0}
-    return 1 - masks.mean().item()
+    assert masks.dtype == torch.bool
+    return 1 - masks.float().mean().item()
 
 
 def test_masks_hide_their_share_of_whole_blocks(monkeypatch):
     assert hidden_share() == pytest.approx(0.7, abs=0.01)
     monkeypatch.setattr(method, "HIDDEN", 0.6)
     assert hidden_share() != pytest.approx(0.7, abs=0.01)
+    # A side that is no multiple of a block's has narrower ones at its end.
+    assert method.block_mask(64, 24, seeded()).shape == (64, 64)
 
 
 def test_what_is_masked_is_learnt_from_the_teachers_labels(stood):
@@ -220,6 +259,41 @@ def test_what_is_masked_is_learnt_from_the_teachers_labels(stood):
     masked, weight = stood[5]
     assert masked.max() < 19
     assert (weight == weight[:, :1, :1]).all()
+
+
+def test_at_first_the_source_teaches_alone(stood):
+    """A run of it alone is the same run without self-training: targets move no weight."""
+    ends = []
+    for seed in (1, 2):
+        learner = method.Learner(replace(TINY, alone=6), 0)
+        source, label, _, _ = batch_of(1)
+        told = learner.step(0, source, label, *batch_of(seed)[2:])
+        assert [*told] == ["source"]
+        ends.append([p.detach().clone() for p in learner.student.parameters()])
+    assert all(torch.equal(a, b) for a, b in zip(*ends, strict=True))
+    assert [*method.Learner(TINY, 0).step(0, *batch_of(1))][2:] == ["source", "mixed", "masked"]
+
+
+def test_the_targets_truth_teaches_nothing():
+    ends = []
+    for truth in (torch.zeros(2, 64, 64, dtype=torch.long), batch_of(1)[3]):
+        learner = method.Learner(TINY, 0)
+        learner.step(0, *batch_of(1)[:3], truth)
+        ends.append([p.detach().clone() for p in learner.student.parameters()])
+    assert all(torch.equal(a, b) for a, b in zip(*ends, strict=True))
+
+
+def test_what_the_teacher_is_unsure_of_counts_nothing():
+    """The weight of masked views is the share of pixels above the threshold, down to nothing."""
+    told = [method.Learner(replace(TINY, confident=c), 0).step(0, *batch_of(1)) for c in (0.0, 1.1)]
+    assert [each["sure"] for each in told] == [1.0, 0.0]
+    assert told[0]["masked"] > 0 == told[1]["masked"]
+    assert 0 < told[1]["mixed"] < told[0]["mixed"]
+
+
+def test_a_teacher_holds_all_that_its_student_holds():
+    """No running statistics: averages of weights are a whole net, in which no buffer lags."""
+    assert not [*method.Network(TINY, 0).buffers()]
 
 
 def test_entropy_is_a_mean_over_labelled_pixels():
@@ -366,6 +440,17 @@ def test_differences_are_paired():
     assert text.endswith("Weathered frames: here.")
 
 
+def test_self_training_is_compared_with_its_source_alone():
+    """A gain of each arm over its own run on the source; arms are not compared across the two."""
+    low = np.array([[confusion_of(right) for right in range(0, 80, 4)]])
+    high = np.array([[confusion_of(right + 10) for right in range(0, 80, 4)]])
+    counts = {"mixed-2d": high, "mixed-2d, uda off": low, "weather_aug": low}
+    text = train_uda.report({name: [each, each] for name, each in counts.items()}, "here")
+    assert re.search(r"mixed-2d - mixed-2d, uda off +0\.100 \[ 0\.100,  0\.100\]", text)
+    assert re.search(r"weather_aug - mixed-2d +-0\.100", text)
+    assert text.count(" - ") == 2
+
+
 # Trainings
 
 
@@ -373,9 +458,9 @@ class Stopped(Exception):
     pass
 
 
-def trained(roles, path, arm="mixed-2d", every=2, seed=0):
+def trained(roles, path, arm="mixed-2d", every=2, seed=0, **changes):
     path.parent.mkdir(parents=True, exist_ok=True)
-    learner = method.Learner(train_uda.QUICK, seed)
+    learner = method.Learner(replace(train_uda.QUICK, **changes), seed)
     streams = frames.loaders(*roles[:2], arm, seed, train_uda.QUICK)
     train_uda.trained(learner, streams, arm, path, every)
     return learner
@@ -446,6 +531,13 @@ def test_arms_and_seeds_end_in_other_weights(roles, tmp_path):
         assert not any(equal(one, other) for other in ends[:place])
 
 
+def test_a_state_of_another_method_is_refused(roles, tmp_path):
+    """Else a run with another threshold would hand back the old one's numbers."""
+    trained(roles, tmp_path / "a" / "state")
+    with pytest.raises(ConflictError, match=r"confident=0\.8.*another --out"):
+        trained(roles, tmp_path / "a" / "state", confident=0.968)
+
+
 def test_a_state_of_another_training_is_refused(roles, tmp_path):
     trained(roles, tmp_path / "a" / "state")
     with pytest.raises(ConflictError, match="seed"):
@@ -467,8 +559,9 @@ def run(folder, *words):
     )
 
 
+@pytest.mark.slow
 def test_a_quick_run_compares_and_goes_on(tmp_path):
-    words = ("--augment", "mixed-2d", "weather_aug", "--seeds", "0", "1")
+    words = ("--augment", "mixed-2d", "weather_aug", "--seeds", "0", "--uda", "on", "off")
     done = run(tmp_path, *words)
     assert done.returncode == 0, done.stderr
     assert re.search(r"weather_aug - mixed-2d +-?\d\.\d{3} \[ ?-?\d\.\d{3}, ", done.stdout)
@@ -478,7 +571,7 @@ def test_a_quick_run_compares_and_goes_on(tmp_path):
     }
     assert len(states) == 4
     assert len(list((tmp_path / "out").glob("*/predictions.png"))) == 4
-    (tmp_path / "out" / "weather_aug-1" / "state.safetensors").unlink()
+    (tmp_path / "out" / "weather_aug, uda off-0" / "state.safetensors").unlink()
     again = run(tmp_path, *words)
     assert again.stdout == done.stdout
     assert {path: path.read_bytes() for path in states} == states

@@ -56,6 +56,24 @@ def encode_row(light, out):
         out[x] = np.uint8(np.int32(encoded(v) + np.float32(0.5)))
 
 
+@compiled
+def apart_row(pixels, red, green, blue):
+    """Colours of a row (W, 3) into rows that may be longer."""
+    for x in range(pixels.shape[0]):
+        red[x] = pixels[x, 0]
+        green[x] = pixels[x, 1]
+        blue[x] = pixels[x, 2]
+
+
+@compiled
+def together_row(red, green, blue, out):
+    """The inverse of `apart_row`."""
+    for x in range(out.shape[0]):
+        out[x, 0] = red[x]
+        out[x, 1] = green[x]
+        out[x, 2] = blue[x]
+
+
 def halves(values: Any) -> Any:
     """float16 of finite float32 `values`, rounded as numpy does, several times as fast.
 

@@ -100,8 +100,8 @@ def _leakage(exported: Exported) -> list[str]:
         lists = ", ".join(_pair_lists(editor["card"]))
         made = f"the editor {editor['editor']} made backgrounds"
         found.append(
-            f"{made}, trained on {lists}: do not evaluate on any picture of that (trained_on.txt "
-            "beside its adapter knows each)"
+            f"{made}, trained on {lists}: do not evaluate on any picture of that (`weather-aug "
+            "inspect EXPORT --against data/acdc/rgb_anon/val` looks each up)"
             if lists
             else f"{made}, and its card names no pictures that trained it: find out before you "
             "evaluate on ACDC"

@@ -264,12 +264,12 @@ def with_geometry(**changes):
 def with_layers(name, change):
     """The kernel with a fault in one layer, a function of (h, w) float16 and the window."""
 
-    def wrong(planes, surface, classes, window, *others):
+    def wrong(surface, classes, window, *others):
         *between, layers, step, tile, out = others
         maps = layers.view(np.float16).copy()
         maps[NAMES.index(name)] = change(maps[NAMES.index(name)], window, step)
         bits = maps.view(np.uint16)
         bits.flags.writeable = False
-        dress(planes, surface, classes, window, *between, bits, step, tile, out)
+        dress(surface, classes, window, *between, bits, step, tile, out)
 
     return wrong

@@ -79,7 +79,7 @@ def transmittance(particles, camera, depth_m=1000.0):
         splats,
         band_starts,
         (zero, zero),
-        np.empty((3, height, -(-width // 16) * 16), np.uint8),
+        np.empty((height, width, 3), np.uint8),
         through,
         np.empty((height, width), np.uint8),
         np.zeros((height, width), np.uint8),

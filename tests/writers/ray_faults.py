@@ -73,7 +73,7 @@ class SeesAnotherDisk(Renderer):
     """Stands on a node that has another folder under the output's path."""
 
     def begin(self) -> Answer:
-        self._token = b"another"
+        self._token = "another"
         return super().begin()
 
 

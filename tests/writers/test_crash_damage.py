@@ -12,6 +12,7 @@ from tiny_export import POLICY, tree_of
 from weather_aug.cli import main
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.writers.export import export
+from weather_aug.writers.merge import merge_cityscapes
 from weather_aug.writers.plan import ExportPlan, plan_export
 from weather_aug.writers.verify import verify_export
 
@@ -103,3 +104,12 @@ def tree_of_extra(out: Path, extra: dict[str, bytes]) -> dict[str, str]:
     assert {name: (out / name).read_bytes() for name in extra} == extra
     tree = tree_of(out)
     return {name: tree[name] for name in extra}
+
+
+def test_what_a_killed_merge_left_is_no_strangers_file(whole: Path, tmp_path: Path) -> None:
+    out = tmp_path / "merged"
+    merge_cityscapes(whole, [], out)
+    left = out / f"merge.json.{'0' * 16}.tmp"
+    left.write_bytes(b"half")
+    assert merge_cityscapes(whole, [], out).samples == 20
+    assert not left.exists()

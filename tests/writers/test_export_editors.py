@@ -21,7 +21,8 @@ from weather_aug.scene.backgrounds_record import TRAINED_ON
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.writers import layout, manifest
 from weather_aug.writers.export import export
-from weather_aug.writers.merge import merge_cityscapes, read_merge
+from weather_aug.writers.merge import merge_cityscapes
+from weather_aug.writers.merged import read_merge
 from weather_aug.writers.plan import ExportPlan, plan_export
 from weather_aug.writers.verify import verify_export
 

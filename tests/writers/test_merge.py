@@ -24,7 +24,7 @@ from weather_aug.errors import (
 )
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.taxonomy import TRAIN_ID
-from weather_aug.writers import merge
+from weather_aug.writers import merge, merged
 from weather_aug.writers.export import export
 from weather_aug.writers.merge import merge_cityscapes
 from weather_aug.writers.plan import plan_export
@@ -92,7 +92,7 @@ def out(tmp_path: Path) -> Path:
 def links_of(out: Path) -> dict[str, Path]:
     """What each link of a merge stands for."""
     paths = [Path(folder, name) for folder, _, names in os.walk(out) for name in names]
-    own = {*NAMES, merge.CONTENTS}
+    own = {*NAMES, merged.CONTENTS}
     return {p.relative_to(out).as_posix(): p.resolve() for p in paths if p.name not in own}
 
 
@@ -232,7 +232,7 @@ def test_links_hold_where_everything_is_moved(exports: list[Path], tmp_path: Pat
     merge_cityscapes(root, [copy], here / "merged")
     here.rename(tmp_path / "there")
     assert len(drawn(tmp_path / "there" / "merged")[TRAIN_ID["sky"]]) == 14
-    for name in (merge.CONTENTS, *NAMES):
+    for name in (merged.CONTENTS, *NAMES):
         assert str(tmp_path) not in (tmp_path / "there" / "merged" / name).read_text()
 
 

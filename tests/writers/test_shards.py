@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -40,7 +40,7 @@ from weather_aug.writers.verify import verify_export
 URL = "memory://bucket/shards"
 
 SCRIPT = """
-import json, sys
+import json, sys, time
 from pathlib import Path
 from weather_aug.scene.policy import WeatherPolicy
 from weather_aug.scene.scene import WeatherScene
@@ -53,7 +53,9 @@ if __name__ == "__main__":
     plan = plan_export([WeatherScene.load(scene)], policy, count=int(count), seed=3)
     print("ready", flush=True)
     sys.stdin.readline()
-    export(plan, Path(out), shard=(int(number), int(of)))
+    # Slow enough that it is at work while others are looked at.
+    pause = lambda _: time.sleep(0.03)
+    export(plan, Path(out), shard=(int(number), int(of)), on_sample=pause)
 """
 
 
@@ -413,10 +415,15 @@ def started(plan: ExportPlan, out: Path, number: int, of: int) -> subprocess.Pop
     )
 
 
-def wait_for_lines(process: subprocess.Popen[str], journal: Path, lines: int) -> None:
+def kill_at(processes: dict[Path, subprocess.Popen[str]], lines: dict[Path, int]) -> None:
+    """Kill each process when its journal has so many lines."""
     deadline_s = time.monotonic() + 60
-    while not journal.exists() or journal.read_bytes().count(b"\n") <= lines:
-        assert process.poll() is None, "it ended before it could be killed"
+    while lines:
+        for journal, count in [*lines.items()]:
+            assert processes[journal].poll() is None, "it ended before it could be killed"
+            if journal.exists() and journal.read_bytes().count(b"\n") > count:
+                processes[journal].kill()
+                del lines[journal]
         assert time.monotonic() < deadline_s
         time.sleep(0.001)
 
@@ -427,19 +434,22 @@ def test_four_shards_at_once_of_which_two_are_killed(
     plan = plan_export([scene], POLICY, count=240, seed=3)
     chance = random.Random(11)
     victims = chance.sample(range(1, 5), 2)
-    processes = {number: started(plan, out, number, 4) for number in range(1, 5)}
-    for process in processes.values():
-        assert process.stdout.readline() == "ready\n"
-    for process in processes.values():
-        process.stdin.write("\n")
-        process.stdin.flush()
-    for number in victims:
-        journal = Shard(number, 4).state(out) / ".export/journal"
-        wait_for_lines(processes[number], journal, chance.randrange(2, 30))
-        processes[number].kill()
-    for number, process in processes.items():
-        process.communicate(timeout=60)
-        assert process.returncode == (-signal.SIGKILL if number in victims else 0)
+    journals = {n: Shard(n, 4).state(out) / ".export/journal" for n in range(1, 5)}
+    with ExitStack() as ended:
+        processes = {}
+        for number, journal in journals.items():
+            processes[journal] = ended.enter_context(started(plan, out, number, 4))
+            ended.callback(processes[journal].kill)
+        for process in processes.values():
+            assert process.stdout.readline() == "ready\n"
+        for process in processes.values():
+            process.stdin.write("\n")
+            process.stdin.flush()
+        kill_at(processes, {journals[number]: chance.randrange(2, 20) for number in victims})
+        for number, journal in journals.items():
+            processes[journal].communicate(timeout=60)
+            expected = -signal.SIGKILL if number in victims else 0
+            assert expected == processes[journal].returncode
     assert 120 < committed(out, plan) < 240
     # One goes on as it was; what the other misses is left to the ordinary run.
     report = export(plan, out, shard=(victims[0], 4))

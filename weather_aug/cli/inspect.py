@@ -75,7 +75,8 @@ def _look_up(against: Path, path: str) -> None:
 def _inspected(path: str) -> tuple[list[str], str]:
     """What is wrong with a scene or an export, one sentence each, and the cure."""
     from weather_aug.scene import store
-    from weather_aug.writers import layout, merge
+    from weather_aug.writers import layout
+    from weather_aug.writers.merged import is_merge
     from weather_aug.writers.source import exists, is_url, source_of
 
     if not is_url(path) and (Path(path) / store.MANIFEST).is_file():
@@ -83,7 +84,7 @@ def _inspected(path: str) -> tuple[list[str], str]:
     source = source_of(path)
     if any(exists(source, name) for name in (layout.CONTENTS, layout.JOURNAL, layout.MARK)):
         return _inspect_export(source)
-    if not is_url(path) and (Path(path) / merge.CONTENTS).is_file():
+    if not is_url(path) and is_merge(Path(path)):
         raise DataError(
             f"{source} is a merge; inspect its exports one by one, or look pictures up in it with "
             "--against"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from weather_aug._compiled import compiled
 from weather_aug.clip.types import FAR_DEPTH_M, Frame, Window
 from weather_aug.errors import ArgumentError
-from weather_aug.taxonomy import SKY
+from weather_aug.taxonomy import IGNORE, SKY
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
@@ -85,6 +85,30 @@ def depth_of(surface: Surface, window: Window) -> Float32:
     out = np.empty(window[2:], np.float32)
     _fill_depth(surface, window, out.view(np.int32), out)
     return out
+
+
+def kinds_of(surface: Surface, window: Window) -> UInt8:
+    """Train ids (H, W) of a window; of an unlabelled one, SKY where depth is endless, else 255."""
+    out = np.empty(window[2:], np.uint8)
+    depth = np.empty(window[3], np.float32)
+    _fill_kinds(surface, window, depth.view(np.int32), depth, out)
+    return out
+
+
+@compiled
+def _fill_kinds(surface, window, bits, depth, out):
+    top, left, height, width = window
+    labelled = surface.label.shape[0] > 0
+    for y in range(height):
+        if labelled:
+            start = (top + y) * surface.width + left
+            for x in range(width):
+                out[y, x] = surface.label[start + x]
+            continue
+        depth_row(surface, top + y, left, bits, depth)
+        sky_row(surface, top + y, left, depth, out[y])
+        for x in range(width):
+            out[y, x] = np.uint8(SKY) if out[y, x] != np.uint8(0) else np.uint8(IGNORE)
 
 
 @compiled

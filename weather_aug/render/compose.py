@@ -15,7 +15,7 @@ from weather_aug.clip.types import Box, Camera, Frame, FrameKey, Window
 from weather_aug.edit.ambience import Ambience
 from weather_aug.edit.physical.layers import Layers
 from weather_aug.edit.physical.look import changes_background
-from weather_aug.edit.surface import checked_window, depth_of, surface_of
+from weather_aug.edit.surface import checked_window, depth_of, kinds_of, surface_of
 from weather_aug.errors import ArgumentError
 from weather_aug.particles.shelter import Shelter
 from weather_aug.render.background import background_of, looked_at
@@ -37,7 +37,7 @@ from weather_aug.render.scattering import scattering_margin_px
 from weather_aug.render.stage import Planes, Stage
 from weather_aug.render.taken import camera_in, sees_whole, taken, window_taken
 from weather_aug.render.traffic import traffic_of
-from weather_aug.taxonomy import IGNORE, SIDEWALK, SKY, TRAIN_ID
+from weather_aug.taxonomy import SIDEWALK, SKY, TRAIN_ID
 from weather_aug.weather import Weather
 
 Float32 = NDArray[np.float32]
@@ -239,15 +239,6 @@ def _margin_px(frame: Frame, options: RenderOptions) -> int:
     return margin
 
 
-def _seen(frame: Frame, window: Window) -> UInt8:
-    """Train ids of a window; where nobody labelled, endlessly far is the sky and the rest 255."""
-    if frame.label is None:
-        far = np.isinf(depth_of(surface_of(frame), window))
-        return np.where(far, np.uint8(SKY), np.uint8(IGNORE))
-    # A copy, because the kernel would be compiled once more for what may not be written.
-    return np.array(frame.label[_part(window)], order="C")
-
-
 def _trimmed(
     shot: Planes,
     glass: Glass | None,
@@ -268,7 +259,7 @@ def _trimmed(
     # Else all surfaces are bright enough behind the glass and none is hazy.
     if shot.hazy_count or covered.any() or through.min() < DOUBTFUL_TRANSMITTANCE:
         planes = readable_labels(
-            _seen(frame, outer),
+            kinds_of(surface_of(frame), outer),
             shot.transmittance,
             through,
             shot.distinct,

@@ -78,21 +78,16 @@ def readable_labels(
     """
     near = np.ones((NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX), np.uint8)
     limits = (HAZY_TRANSMITTANCE, DOUBTFUL_TRANSMITTANCE, LEAST_TRANSMITTANCE)
-    vanished, doubtful = np.empty_like(label), np.empty_like(label)
-    inputs = (label, air, transmittance, cv2.dilate(distinct, near))
+    if small is None:
+        small = np.ones_like(label)
+    unseen, invalid, gone = (np.empty(label.shape, np.uint8) for _ in range(3))
+    inputs = (label, air, transmittance, cv2.dilate(distinct, near), covered, small)
     count = read_labels(
         *(np.ascontiguousarray(plane).reshape(-1) for plane in inputs),
         tuple(np.float32(limit) for limit in limits),
-        np.uint8(SKY),
-        vanished.reshape(-1),
-        doubtful.reshape(-1),
+        *(plane.reshape(-1) for plane in (unseen, invalid, gone)),
     )
-    unseen = cv2.bitwise_or(vanished, covered)
-    if small is not None:
-        doubtful &= small
-    invalid = cv2.bitwise_or(unseen, doubtful)
     if count:
-        gone = vanished & (label != IGNORE)
         invalid |= cv2.dilate(gone, near) & (label == SKY)
     return Sight(unseen, invalid)
 
@@ -125,29 +120,35 @@ def least_linear_contrast(airlight: NDArray[np.floating]) -> float:
 
 
 @compiled
-def read_labels(label, air, through, near_distinct, limits, sky_id, vanished, doubtful):
-    """What has vanished and what is doubtful, by `readable_labels`; all arrays are (N,).
+def read_labels(label, air, through, near_distinct, covered, small, limits, unseen, invalid, gone):
+    """What cannot be seen or is doubtful, by `readable_labels`; all arrays are (N,).
 
     Args:
         label: uint8 train ids.
         air: float32 transmittance of air and particles.
         through: float32 transmittance of air, particles and glass.
         near_distinct: uint8, 1 where something distinct is near.
+        covered: uint8, 1 where the surface is hidden.
+        small: uint8, 1 where a thing beyond the optical range is invalid.
         limits: Transmittances below which a surface is hazy, doubtful, hidden.
-        sky_id: Id of the sky.
-        vanished: uint8 out, 1 where a surface cannot be told from the air.
-        doubtful: uint8 out, 1 where a surface is beyond the optical range.
+        unseen: uint8 out, 1 where a surface is hidden or cannot be told from the air.
+        invalid: uint8 out, 1 there and where a small surface is beyond the optical range.
+        gone: uint8 out, 1 where a surface that somebody labelled cannot be told from the air.
 
     Returns:
-        Number of vanished surfaces.
+        Number of surfaces that are gone.
     """
     hazy, doubt, hidden = limits
     count = np.int64(0)
     for i in range(label.shape[0]):
         t = through[i]
-        surface = label[i] != sky_id
+        surface = label[i] != np.uint8(SKY)
         lost = surface & ((t < hidden) | ((air[i] < hazy) & (near_distinct[i] == 0)))
-        vanished[i] = np.uint8(1) if lost else np.uint8(0)
-        doubtful[i] = np.uint8(1) if surface & (t < doubt) else np.uint8(0)
-        count += np.int64(1) if lost else np.int64(0)
+        doubtful = np.uint8(1) if surface & (t < doubt) else np.uint8(0)
+        blind = np.uint8((np.uint8(1) if lost else np.uint8(0)) | covered[i])
+        unseen[i] = blind
+        invalid[i] = np.uint8(blind | np.uint8(doubtful & small[i]))
+        known = lost & (label[i] != np.uint8(IGNORE))
+        gone[i] = np.uint8(1) if known else np.uint8(0)
+        count += np.int64(1) if known else np.int64(0)
     return count

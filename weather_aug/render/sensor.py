@@ -21,8 +21,9 @@ from weather_aug._checks import finite, image_uint8
 from weather_aug._keys import check_seed, key_of
 from weather_aug.clip.types import Camera, FrameKey, Window
 from weather_aug.colour import SRGB_LEVELS_LINEAR
-from weather_aug.edit.surface import checked_window
+from weather_aug.edit.surface import checked_window, shared
 from weather_aug.errors import ArgumentError
+from weather_aug.render.compression import BLOCK_PX, steps_of
 from weather_aug.render.sensor_kernels import expose, levels_of, spread_across
 from weather_aug.weather import Weather
 
@@ -70,7 +71,6 @@ GLARE_WIDTH_PX = 128
 BEST_QUALITY, LEAST_QUALITY = 95, 80
 QUALITY_PER_LEVEL = 5.0
 """What noise of one level at middle grey costs, because it takes bits."""
-COMPRESSION_BLOCK_PX = 8
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ def quality_of(noise: NoiseLevel) -> int:
 def block_window(window: Window, camera: Camera) -> Window:
     """The smallest window around `window` that cuts no block of the whole picture's compression."""
     top, left, rows, columns = window
-    block = COMPRESSION_BLOCK_PX
+    block = BLOCK_PX
     first, start = top // block * block, left // block * block
     end = min(-(-(top + rows) // block) * block, camera.height)
     stop = min(-(-(left + columns) // block) * block, camera.width)
@@ -247,14 +247,12 @@ def exposed(
     veil = np.empty((0, 0, 3), np.float32)
     if share > 0.0:
         veil = np.float32(share) * _scattered(_checked_whole(whole))
-    out = image
-    if share > 0.0 or (noise and grainy):
-        sigma = level.sigma_levels if noise and grainy else np.empty(0)
-        key = noise_key(seed, frame_key)
-        out = _exposed(image, window, camera, key, sigma.astype(np.float32), share, veil)
-    if compression and grainy:
-        return _compressed(out, quality_of(level))
-    return out if out is not image else image.copy()
+    noisy, compressed = noise and grainy, compression and grainy
+    if not (share > 0.0 or noisy or compressed):
+        return image.copy()
+    sigma = level.sigma_levels.astype(np.float32) if noisy else np.empty(0, np.float32)
+    steps = steps_of(quality_of(level)) if compressed else np.empty((0, 8, 8), np.float32)
+    return _exposed(image, window, camera, noise_key(seed, frame_key), sigma, share, veil, steps)
 
 
 def noise_key(seed: int, frame_key: FrameKey) -> int:
@@ -272,19 +270,17 @@ def _exposed(
     sigma: Float32,
     share: float,
     veil: Float32,
+    steps: Float32,
 ) -> UInt8:
     top, left, height, width = window
     wide = (width + 15) // 16 * 16
-    planes = np.zeros((3, height, wide), np.uint8)
-    for channel in range(3):
-        cv2.extractChannel(image, channel, planes[channel, :, :width])
     columns, column_shares = _places(left, wide, camera.width, veil.shape[1])
     rows, row_shares = _places(top, height, camera.height, veil.shape[0])
     across = np.empty((veil.shape[0], 3, wide), np.float32)
     spread_across(veil, columns, column_shares, across)
-    out = np.empty_like(planes)
+    out = np.empty(image.shape, np.uint8)
     expose(
-        planes,
+        shared(image),
         (top, left),
         np.uint64(key),
         sigma,
@@ -293,10 +289,10 @@ def _exposed(
         across,
         rows,
         row_shares,
+        steps,
         out,
     )
-    merged: UInt8 = cv2.merge(tuple(out[:, :, :width]))
-    return merged
+    return out
 
 
 def _places(
@@ -326,19 +322,6 @@ def _scattered(whole: Float32) -> Float32:
         wide = cv2.resize(blurred, (columns, rows), interpolation=cv2.INTER_LINEAR)
         out += np.float32(share) * wide
     return out
-
-
-def _compressed(image: UInt8, quality: int) -> UInt8:
-    """`image` after a JPEG whose blocks of 8 x 8 pixels know nothing of each other.
-
-    Colours are kept at full resolution: halved, they would be smoothed over the blocks' borders,
-    and a window would differ from the whole.
-    """
-    options = [cv2.IMWRITE_JPEG_QUALITY, quality]
-    options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
-    _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
-    decoded: UInt8 = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR_RGB), np.uint8)
-    return decoded
 
 
 @lru_cache(maxsize=1)

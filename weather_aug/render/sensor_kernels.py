@@ -1,4 +1,4 @@
-"""Noise and glare of a camera's sensor, row by row. Compiled.
+"""Noise, glare and compression of a camera's picture, row by row. Compiled.
 
 A pixel's noise is a hash of its place in the whole picture, so a window has the pixels of the whole
 one. Rows are padded to whole vectors: the few pixels left over would cost as much as hundreds.
@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weather_aug._compiled import compiled, inlined
-from weather_aug._rows import encoded
+from weather_aug._rows import apart_row, encoded, together_row
 from weather_aug.particles.kernels import GOLDEN, mix64
+from weather_aug.render.compression import BLOCK_PX, compress
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
@@ -41,30 +42,38 @@ def expose(
     across: Float32,
     rows: NDArray[np.int64],
     shares: Float32,
+    steps: Float32,
     out: UInt8,
 ) -> None:
-    """Add glare, then noise, to a window.
+    """Add glare, then noise, to a window, and compress it.
+
+    Eight rows at a time, because a block's pixels are then still at hand.
 
     Args:
-        image: (3, H, W) sRGB levels; W a multiple of 16.
+        image: (H, W, 3) sRGB levels.
         corner: (top, left) of the window in the whole picture, pixels.
         key: Of the frame's noise.
         sigma: (256,) float32 standard deviation of the noise by level, levels; (0,) for no noise.
         light: (256,) float32 linear light by level.
         kept: Share of the light that is not scattered.
-        across: (h, 3, W) veil as it is on each row of the small picture; (0, 3, W) for no glare.
+        across: (h, 3, W rounded up to a multiple of 16) veil as it is on each row of the small
+            picture; (0, 3, ...) for no glare.
         rows: (H,) first of the two rows of `across` between which a row lies.
         shares: (H,) float32 share of the second.
-        out: (3, H, W) uint8 out.
+        steps: (3, 8, 8) float32 steps of the compression; (0, 8, 8) for none.
+        out: (H, W, 3) uint8 out.
     """
     top, left = corner
-    _, height, wide = image.shape
+    height, width, _ = image.shape
+    wide = across.shape[2]
     raw = np.zeros((5, wide + 2 * REACH_PX), np.float32)
     fine = np.zeros_like(raw)
     own, other = np.empty(wide + 2 * REACH_PX, np.float32), np.empty(raw.shape[1], np.float32)
     noise = np.empty((3, wide), np.float32)
-    level = np.empty(wide, np.float32)
+    level, deviation = np.empty(wide, np.float32), np.empty(wide, np.float32)
     noisy, veiled = sigma.shape[0] > 0, across.shape[0] > 0
+    strip = np.zeros((3, BLOCK_PX, wide), np.uint8)
+    words = strip.view(np.uint64)
     odd = np.empty(wide, np.bool_)
     for x in range(wide):
         odd[x] = (x + left) & 1 == 1
@@ -73,6 +82,8 @@ def expose(
             v = top - REACH_PX + k
             _draw_row(key, v, left, raw[v % 5], fine[v % 5])
     for y in range(height):
+        k = y % BLOCK_PX
+        apart_row(image[y], strip[0, k], strip[1, k], strip[2, k])
         if noisy:
             v = top + y
             _draw_row(key, v + REACH_PX, left, raw[(v + REACH_PX) % 5], fine[(v + REACH_PX) % 5])
@@ -88,16 +99,38 @@ def expose(
                 _fill_in_green(b, c, d, odd, False, noise[1])
                 _fill_in(own, odd, False, noise[2])
             _add_brightness(fine[(v - 1) % 5], fine[v % 5], fine[(v + 1) % 5], noise)
-        for channel in range(3):
-            if veiled:
-                upper, lower = across[rows[y], channel], across[rows[y] + 1, channel]
-                _light_row(image[channel, y], light, level)
-                _veil_row(kept, upper, lower, shares[y], level)
-            else:
-                _copy_row(image[channel, y], level)
-            if noisy:
-                _add_noise(image[channel, y], sigma, noise[channel], level)
-            _round_row(level, out[channel, y])
+        if noisy or veiled:
+            for channel in range(3):
+                levels = strip[channel, k]
+                if veiled:
+                    upper, lower = across[rows[y], channel], across[rows[y] + 1, channel]
+                    _look_up_row(levels, light, level)
+                    _veil_row(kept, upper, lower, shares[y], level)
+                else:
+                    _copy_row(levels, level)
+                if noisy:
+                    _look_up_row(levels, sigma, deviation)
+                    _add_noise(deviation, noise[channel], level)
+                _round_row(level, levels)
+        if k + 1 < BLOCK_PX and y + 1 < height:
+            continue
+        if steps.shape[0] > 0:
+            _fill_blocks(strip, k + 1, width)
+            compress(words, steps)
+        for i in range(k + 1):
+            together_row(strip[0, i], strip[1, i], strip[2, i], out[y - k + i])
+
+
+@compiled
+def _fill_blocks(strip: UInt8, height: np.int64, width: np.int64) -> None:
+    """Repeat the last column and row of a strip in the blocks that the picture's end cuts."""
+    for channel in range(3):
+        for y in range(height):
+            row = strip[channel, y]
+            for x in range(width, (width + BLOCK_PX - 1) // BLOCK_PX * BLOCK_PX):
+                row[x] = row[width - 1]
+        for y in range(height, BLOCK_PX):
+            strip[channel, y] = strip[channel, height - 1]
 
 
 @compiled
@@ -222,10 +255,10 @@ def _add_brightness(above: Float32, row: Float32, below: Float32, noise: Float32
 
 
 @compiled
-def _light_row(levels: UInt8, light: Float32, out: Float32) -> None:
+def _look_up_row(levels: UInt8, table: Float32, out: Float32) -> None:
     """Look levels up; alone, because loops that look up are not vectorised."""
     for x in range(out.shape[0]):
-        out[x] = light[levels[x]]
+        out[x] = table[levels[x]]
 
 
 @compiled
@@ -258,9 +291,9 @@ def _copy_row(levels: UInt8, out: Float32) -> None:
 
 
 @compiled
-def _add_noise(levels: UInt8, sigma: Float32, noise: Float32, out: Float32) -> None:
+def _add_noise(deviation: Float32, noise: Float32, out: Float32) -> None:
     for x in range(out.shape[0]):
-        out[x] += sigma[levels[x]] * noise[x]
+        out[x] += deviation[x] * noise[x]
 
 
 @compiled

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from weather_aug._compiled import compiled
-from weather_aug._rows import encode_row
+from weather_aug._rows import encode_row, together_row
 from weather_aug.edit.surface import depth_row, light_row, sky_row
 from weather_aug.render.medium import air_row, rays_across, row_space
 from weather_aug.render.project import BAND_ROWS, LARGE
@@ -50,7 +50,7 @@ def shade(
         band_starts: (bands + 1,) where each band's splats start.
         limits: Linear difference from the airlight that can just be seen, and the transmittance
             below which a surface must differ from it to be seen.
-        out: (3, H, W rounded up to a multiple of 16) uint8 out.
+        out: (H, W, 3) uint8 out.
         through: (H, W) float32 out: transmittance of air and particles.
         distinct: (H, W) uint8 out: 1 where what is left of a surface's difference from the
             airlight can be seen.
@@ -73,6 +73,7 @@ def shade(
     tiles = np.empty((BAND_ROWS // 4, stride // 4, TILE_FLOATS), np.float32)
     gap = np.empty((BAND_ROWS, wide), np.float32)
     sky = np.zeros((BAND_ROWS, wide), np.uint8)
+    levels = np.empty((3, wide), np.uint8)
     hidden = 0
     for band in range(band_starts.shape[0] - 1):
         y0 = band * BAND_ROWS
@@ -109,9 +110,10 @@ def shade(
             k = y - y0
             for channel in range(3):
                 if encoded:
-                    _level_row(planes[k, channel, :wide], out[channel, y])
+                    _level_row(planes[k, channel, :wide], levels[channel])
                 else:
-                    encode_row(planes[k, channel, :wide], out[channel, y])
+                    encode_row(planes[k, channel, :wide], levels[channel])
+            together_row(levels[0], levels[1], levels[2], out[y])
             _copy_row(planes[k, 3, :width], through[y])
             _distinct_row(gap[k], through[y], sky[k], least_contrast, distinct[y])
             hidden += _count_below(through[y], sky[k], hazy)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -176,7 +175,7 @@ class Stage:
             linear, hiding = np.arange(256) / 255, np.full(3, veil)
             contrast = LEAST_CONTRAST_LEVELS / 255
         limits = (contrast, HAZY_TRANSMITTANCE)
-        levels = np.empty((3, height, (width + 15) // 16 * 16), np.uint8)
+        image = np.empty((height, width, 3), np.uint8)
         through = np.empty((height, width), np.float32)
         distinct = np.empty((height, width), np.uint8)
         covered = np.zeros((height, width), np.uint8)
@@ -193,13 +192,12 @@ class Stage:
             splats,
             band_starts,
             tuple(np.float32(v) for v in limits),
-            levels,
+            image,
             through,
             distinct,
             covered,
         )
-        merged: UInt8 = cv2.merge(tuple(levels[:, :, :width]))
-        return Planes(merged, through, distinct, covered, hazy_count)
+        return Planes(image, through, distinct, covered, hazy_count)
 
 
 def optics_of(camera: Camera, up_world: Float64) -> Optics:

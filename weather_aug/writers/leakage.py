@@ -24,7 +24,7 @@ from weather_aug.edit.editors import UNTRAINED
 from weather_aug.errors import DataError, printable
 from weather_aug.scene import store
 from weather_aug.scene.scene import WeatherScene
-from weather_aug.writers import layout, merge
+from weather_aug.writers import layout, merged
 from weather_aug.writers.editors import RECORD, editors_of
 from weather_aug.writers.source import Source, contents_of, exists, is_url, source_of
 
@@ -126,8 +126,8 @@ def _editors(out: str | Path) -> tuple[Any, Callable[[Any], TrainedOn]]:
     if not is_url(out) and (Path(out) / store.MANIFEST).is_file():
         scene = WeatherScene.load(out)
         return editors_of([scene]), lambda name: _of_scene(scene)
-    if not is_url(out) and (Path(out) / merge.CONTENTS).is_file():
-        contents = merge.read_merge(Path(out))
+    if not is_url(out) and (Path(out) / merged.CONTENTS).is_file():
+        contents = merged.read_merge(Path(out))
         return contents.get("editors"), partial(_of_merge, Path(out), contents)
     source = source_of(out)
     if not exists(source, layout.CONTENTS):

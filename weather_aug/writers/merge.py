@@ -39,11 +39,10 @@ from weather_aug.writers import layout
 from weather_aug.writers.cityscapes import ClassStats
 from weather_aug.writers.editors import RECORD
 from weather_aug.writers.manifest import usable_lines
+from weather_aug.writers.merged import CONTENTS, FORMAT, is_merge, read_merge
 from weather_aug.writers.sample import class_pixels
 from weather_aug.writers.target import LocalFolder
 
-FORMAT = "weather_aug merge"
-CONTENTS = "merge.json"
 SPLIT = "train"
 """The split that exports join and that statistics count, as the trainers' converter does."""
 CONVERTER = "python tools/convert_datasets/cityscapes.py"
@@ -172,20 +171,12 @@ def _checked_out(out: Path, sources: list[Path]) -> Path:
         if out.exists() and not out.is_dir():
             raise OutputError(f"{printable(out, 200)} is not a folder; choose another output")
         found = {path.name for path in out.iterdir()} - {_LOCK} if out.exists() else set()
-    if found and not _is_merge(out):
+    if found and not is_merge(out):
         raise ConflictError(
             f"{printable(out, 200)} is no merge, but holds {printable(sorted(found)[0])}; choose "
             "an empty or new folder"
         )
     return out
-
-
-def _is_merge(out: Path) -> bool:
-    try:
-        contents = _files.read_json(out / CONTENTS)
-    except DataError:
-        return False
-    return isinstance(contents, dict) and contents.get("format") == FORMAT
 
 
 def _source_of_root(root: Path, progress: bool) -> _Source:
@@ -357,26 +348,6 @@ def _contents(out: Path, root: Path, exports: Sequence[Path], merged: _Source) -
         "files": merged.records,
     }
     return layout.sealed_contents(fields)
-
-
-def read_merge(out: Path) -> dict[str, Any]:
-    """Read and check a merge's `merge.json`.
-
-    Raises:
-        DataError: If it is not a merge's.
-        IntegrityError: If its own digest does not match.
-    """
-    path = out / CONTENTS
-    contents = _files.read_json(path)
-    if not isinstance(contents, dict) or contents.get("format") != FORMAT:
-        raise DataError(f"{printable(path, 200)} is not of a {FORMAT}; run the merge again")
-    contents.pop("sha256", None)
-    if path.read_bytes() != layout.sealed_contents(contents):
-        raise IntegrityError(
-            f"{printable(path, 200)} has changed since it was written, or is of an earlier "
-            "version; run the merge again"
-        )
-    return contents
 
 
 def _entries(out: Path) -> Iterator[tuple[str, Path]]:

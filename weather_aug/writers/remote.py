@@ -104,7 +104,9 @@ class FsspecFolder:
         with self.place.reported("", "write"):
             for path in [*self.place.entries(), *self.place.below((*layout.roots, STATE))]:
                 if path.endswith(suffix):
-                    self._fs.rm_file(path)
+                    # A writer that lost touch may just have renamed it.
+                    with suppress(FileNotFoundError):
+                        self._fs.rm_file(path)
 
     def found_job(self) -> Any:
         """The job that the place is of, finished or not; None if nothing there tells.

@@ -74,6 +74,7 @@ class LocalFolder:
     def make_folders(self, relatives: Iterable[str]) -> None:
         """Each with its parents, durably."""
         with _files.reported(self.path):
+            self.path.mkdir(parents=True, exist_ok=True)
             # The state's name first: after a power cut, samples without it would be nobody's.
             _files.sync_folder(self.path)
             for relative in relatives:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from weather_aug._compiled import compiled
-from weather_aug._rows import encode_row, survival
+from weather_aug._rows import apart_row, encode_row, survival, together_row
 from weather_aug.edit.physical.buffer import BELOW_TOP, FREE, GROUNDED, LUMA, ROWS, SKYNESS, B, G, R
 from weather_aug.edit.physical.ground_rows import ground_run
 from weather_aug.edit.physical.layer_rows import load_row
@@ -56,14 +56,11 @@ class Geometry(NamedTuple):
 
 
 @compiled
-def dress(
-    planes, surface, classes, window, geometry, look, tint, tone, table, layers, step, tile, out
-):
+def dress(surface, classes, window, geometry, look, tint, tone, table, layers, step, tile, out):
     """Paint one window's background in the weather.
 
     Args:
-        planes: (3, H, W) uint8 sRGB of the window.
-        surface: The whole picture's depth and label.
+        surface: The whole picture, its depth and label.
         classes: (N,) uint8 train ids of the whole picture, guessed where nobody labelled.
         window: (top, left, height, width) in the whole picture.
         geometry: Camera of the whole picture.
@@ -75,7 +72,7 @@ def dress(
         layers: (20, h, w) uint16, bits of the float16 layers of the whole picture.
         step: Pixels of a cell, float32.
         tile: Noise.
-        out: (3, H, W) uint8 out.
+        out: (H, W, 3) uint8 out.
     """
     top, left, height, width = window
     curve, by_root, matrix = tone
@@ -94,6 +91,7 @@ def dress(
     count, _ = knots_across(left, width, surface.width)
     knots = np.empty((2, count), np.float32)
     knot_depth = np.empty(count * KNOT_PX, np.float32)
+    levels = np.empty((3, width), np.uint8)
     kinds = np.empty(width, np.uint8)
     class_above = np.full(width, np.uint8(255), np.uint8)
     for x in range(width):
@@ -126,7 +124,8 @@ def dress(
                 at[row % 2] = row
         down = place - np.float32(upper)
         _lerp_rows(pair, upper % 2, lower % 2, down, first_cell, last_cell, small)
-        _light(planes, y - top, curve, width, b)
+        apart_row(surface.image[first : first + width], levels[0], levels[1], levels[2])
+        _light(levels, curve, width, b)
         if look.flattening > zero:
             _flatten(kinds, table, small, cell, share, look, tint, width, b)
         _tone(look.exposure, matrix, width, b)
@@ -156,7 +155,8 @@ def dress(
         if look.sky > zero and _any_sky(small, first_cell, last_cell):
             _sky(small, cell, share, left, y, geometry, look, width, b)
         for channel in range(3):
-            encode_row(b[channel, :width], out[channel, y - top])
+            encode_row(b[channel, :width], levels[channel])
+        together_row(levels[0], levels[1], levels[2], out[y - top])
 
 
 @compiled
@@ -187,20 +187,20 @@ def _any_sky(small, first, last):
 
 
 @compiled
-def _light(planes, row, curve, width, b):
+def _light(levels, curve, width, b):
     """Linear light of a row, its sRGB luma, and its feature of the sky."""
     for channel in range(3):
         for x in range(width):
-            b[channel, x] = curve[planes[channel, row, x]]
+            b[channel, x] = curve[levels[channel, x]]
     for x in range(width):
         b[LUMA, x] = (
-            np.float32(0.2126 / 255) * np.float32(planes[0, row, x])
-            + np.float32(0.7152 / 255) * np.float32(planes[1, row, x])
-            + np.float32(0.0722 / 255) * np.float32(planes[2, row, x])
+            np.float32(0.2126 / 255) * np.float32(levels[0, x])
+            + np.float32(0.7152 / 255) * np.float32(levels[1, x])
+            + np.float32(0.0722 / 255) * np.float32(levels[2, x])
         )
     red, blue = np.float32(SKY_FEATURE[0] / 255), np.float32(SKY_FEATURE[2] / 255)
     for x in range(width):
-        b[SKYNESS, x] = red * np.float32(planes[0, row, x]) + blue * np.float32(planes[2, row, x])
+        b[SKYNESS, x] = red * np.float32(levels[0, x]) + blue * np.float32(levels[2, x])
 
 
 @compiled

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection
 from functools import lru_cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -79,11 +78,8 @@ def dressed(
         (H, W, 3) sRGB.
     """
     labelled = frame.label is not None
-    top, left, height, width = window
-    out = np.empty((3, height, width), np.uint8)
-    part = frame.image[top : top + height, left : left + width]
+    out = np.empty((*window[2:], 3), np.uint8)
     dress(
-        np.stack(cv2.split(part)),
         surface_of(frame),
         shared(layers.classes).reshape(-1),
         window,
@@ -97,8 +93,7 @@ def dressed(
         noise_tile(),
         out,
     )
-    image: UInt8 = cv2.merge(tuple(out))
-    return image
+    return out
 
 
 def geometry_of(camera: Camera, axes_world: Float64, plane: Float64, *, labelled: bool) -> Geometry:

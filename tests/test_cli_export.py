@@ -17,6 +17,7 @@ from weather_aug.cli.export import parsed_balance, told_bytes, told_seconds
 from weather_aug.errors import ArgumentError
 from weather_aug.scene.scene import WeatherScene
 from weather_aug.writers.balance import ClassBalance
+from weather_aug.writers.layout import sealed_contents
 from weather_aug.writers.verify import verify_export
 
 Captured = pytest.CaptureFixture[str]
@@ -256,6 +257,7 @@ def test_a_sheet_that_cannot_be_written_is_a_warning(
         ("--parts label", "image"),
         ("--split ../up", "split"),
         ("--balance pixels=3", "--balance takes"),
+        ("--address auto", "give --engine ray"),
     ],
 )
 def test_flags_that_mean_nothing_are_exit_code_2(
@@ -275,6 +277,27 @@ def test_another_jobs_folder_is_exit_code_5(
     capsys.readouterr()
     code, line = refused([*command, "2"], capsys)
     assert (code, "another job" in line) == (5, True), line
+
+
+def test_inspect_says_what_it_is_if_not_whole(
+    tiny_scene: WeatherScene, tmp_path: Path, capsys: Captured
+) -> None:
+    out, merged = tmp_path / "data", tmp_path / "merged"
+    main(f"export {tiny_scene.path} --out {out} --count 2 --quiet".split())
+    main(["merge", str(out), "--out", str(merged)])
+    capsys.readouterr()
+    code, line = refused(["inspect", str(merged)], capsys)
+    assert (code, "is a merge; inspect its exports" in line) == (3, True), line
+    code, line = refused(["inspect", str(tmp_path / "typo")], capsys)
+    assert (code, line.endswith("does not exist; check the path")) == (3, True), line
+    contents = json.loads((out / "export.json").read_text())
+    del contents["sha256"], contents["samples_by_kind"]
+    (out / "export.json").write_bytes(sealed_contents(contents))
+    code, line = refused(["inspect", str(out)], capsys)
+    assert (code, "is not whole (1 problem)" in line) == (4, True), line
+    main(f"export {tiny_scene.path} --out {tmp_path / 'cut'} --count 4 --shard 1/2 --quiet".split())
+    code, line = refused(["inspect", str(tmp_path / "cut")], capsys)
+    assert (code, line.endswith("run the same export again")) == (4, True), line
 
 
 def test_sizes_and_times_are_for_people() -> None:

@@ -165,7 +165,11 @@ def test_an_export_to_a_url(
     assert "time     all samples are there already" in again
     main(["inspect", SECRET])
     whole = capsys.readouterr().out
-    assert whole == "every file is whole\n"
+    assert re.fullmatch(
+        r"6 samples, 6 labelled \(.+\); layout cityscapes, train: image, label\n"
+        "every file is whole\n",
+        whole,
+    )
     for text in (captured.out, again, whole):
         assert "secret" not in text and "hidden" not in text
     main(f"export {tiny_scene.path} --out {tmp_path / 'data'} --count 6 --quiet".split())
@@ -213,6 +217,9 @@ def test_messages_about_urls_hold_no_password(
         ([*export, "s3://me:secret@x/y?token=hidden"], (2, "s3://x/y needs a package")),
         ([*export, "nosuch://me:secret@x/y?token=hidden"], (2, "nosuch://x/y cannot be opened")),
         ([*export, SECRET, "--workers", "2"], (5, "")),
+        (["export", "s3://me:secret@x/y", "--out", "a"], (2, "a url (s3://…) stands where")),
+        (["merge", "a", "s3://me:secret@x/y", "--out", "b"], (2, "a url (s3://…) stands where")),
+        (["inspect", "a", "--against", "s3://me:secret@x/y"], (2, "a url (s3://…) stands")),
     ):
         code, line = refused(command, capsys)
         assert (code, expected[1] in line) == (expected[0], True), line

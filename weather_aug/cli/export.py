@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from weather_aug.cli.terminal import complain, say, to_people
-from weather_aug.cli.values import numbers_by_name
+from weather_aug.cli.values import check_local, numbers_by_name
 from weather_aug.errors import ArgumentError, DataError, IntegrityError, OutputError, printable
 
 if TYPE_CHECKING:
@@ -31,8 +31,9 @@ _AGAINST = {"weather": _OF_DRAWS, "list": ("weather", *_OF_DRAWS, "seed"), "shar
 class Export:
     """Write an offline data set; run again to continue.
 
-    Says first what it will be, its size and how long it takes; ends with a contact sheet beside the
-    folder (of a url, in the working directory) and the classes of what was written.
+    Says first what it will be, its size and how long it takes (the first run on a machine compiles
+    for a minute or two before that); ends with a contact sheet beside the folder (of a url, in the
+    working directory) and the classes of what was written.
     """
 
     scenes: Positional[tuple[Path, ...]]
@@ -168,13 +169,16 @@ class Export:
         return [WeatherScene.load(path) for path in self.scenes]
 
     def _check(self) -> None:
-        """Refuse flags that mean nothing together."""
+        """Refuse flags that mean nothing together, and urls where there can be none."""
+        check_local(*self.scenes, *(path for path in (self.list, self.state) if path is not None))
         for name, others in _AGAINST.items():
             if getattr(self, name) == getattr(Export, name):
                 continue
             clash = [other for other in others if getattr(self, other) != getattr(Export, other)]
             if clash:
                 raise ArgumentError(f"--{name} does not go with --{clash[0]}")
+        if self.address is not None and self.engine != "ray":
+            raise ArgumentError("--address is of a Ray cluster; give --engine ray with it")
         if self.seeds != Export.seeds and not self.weather:
             raise ArgumentError("--seeds needs --weather; --count says how many samples are drawn")
 

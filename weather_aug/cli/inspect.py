@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from weather_aug.cli.terminal import say, to_people
+from weather_aug.cli.values import check_local
 from weather_aug.errors import DataError, IntegrityError, printable
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ class Inspect:
         if self.against is None:
             self._verify()
         else:
+            check_local(self.against)
             _look_up(self.against, self.path)
 
     def _verify(self) -> None:
@@ -74,30 +76,57 @@ def _inspected(path: str) -> tuple[list[str], str]:
     """What is wrong with a scene or an export, one sentence each, and the cure."""
     from weather_aug.scene import store
     from weather_aug.writers import layout
+    from weather_aug.writers.merged import is_merge
     from weather_aug.writers.source import exists, is_url, source_of
-    from weather_aug.writers.verify import verify_export
 
     if not is_url(path) and (Path(path) / store.MANIFEST).is_file():
         return _inspect_scene(Path(path)), "build the scene again"
     source = source_of(path)
     if any(exists(source, name) for name in (layout.CONTENTS, layout.JOURNAL, layout.MARK)):
-        return verify_export(source), _cure_of_export(source)
+        return _inspect_export(source)
+    if not is_url(path) and is_merge(Path(path)):
+        raise DataError(
+            f"{source} is a merge; inspect its exports one by one, or look pictures up in it with "
+            "--against"
+        )
+    if not is_url(path) and not Path(path).exists():
+        raise DataError(f"{source} does not exist; check the path")
     raise DataError(
-        f"{source} is neither a scene (no {store.MANIFEST}) nor an export (no {layout.CONTENTS})"
+        f"{source} is neither a scene (no {store.MANIFEST}) nor an export (no {layout.CONTENTS}); "
+        "check the path"
     )
 
 
-def _cure_of_export(source: Source) -> str:
+def _inspect_export(source: Source) -> tuple[list[str], str]:
     from weather_aug.writers import layout
     from weather_aug.writers.source import contents_of, exists
+    from weather_aug.writers.verify import verify_export
 
+    if not exists(source, layout.CONTENTS):
+        return verify_export(source), "run the same export again"
     try:
-        if exists(source, layout.CONTENTS):
-            contents_of(source)
+        contents = contents_of(source)
     except (DataError, IntegrityError):
         # Nobody knows any more which job it was.
-        return "remove the folder and export again"
-    return "run the same export again with --verify to repair it"
+        return verify_export(source), "remove the folder and export again"
+    problems = verify_export(source)
+    if not problems:
+        try:
+            say(_held(contents))
+        except (KeyError, TypeError, AttributeError) as error:
+            problems = [f"{source} is malformed: {type(error).__name__} {error}"]
+    return problems, "run the same export again with --verify to repair it"
+
+
+def _held(contents: Mapping[str, Any]) -> str:
+    """What a whole export holds."""
+    job, kinds = contents["job"], contents["samples_by_kind"]
+    parts = ", ".join(printable(part) for part in job["parts"])
+    weathers = ", ".join(f"{count} {printable(kind)}" for kind, count in kinds.items())
+    return (
+        f"{contents['samples']} samples, {contents['labelled']} labelled ({weathers}); layout "
+        f"{printable(job['layout'])}, {printable(job['split'])}: {parts}"
+    )
 
 
 def _inspect_scene(path: Path) -> list[str]:

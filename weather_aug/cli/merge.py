@@ -8,6 +8,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from weather_aug.cli.terminal import complain, say, to_people
+from weather_aug.cli.values import check_local
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class Merge:
         from weather_aug.writers.cityscapes import MIN_PIXELS
         from weather_aug.writers.merge import merge_cityscapes
 
+        check_local(self.root, *self.exports, self.out)
         report = merge_cityscapes(
             self.root, self.exports, self.out, hard=self.hard, progress=to_people()
         )

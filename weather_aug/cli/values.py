@@ -2,7 +2,28 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 from weather_aug.errors import ArgumentError, printable
+
+_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
+
+
+def check_local(*paths: Path) -> None:
+    """Refuse urls where only files of this machine are read.
+
+    Raises:
+        ArgumentError: If a path is one. A path has lost a slash of "://", by which messages know
+            what to keep to themselves, so the sentence does not repeat it.
+    """
+    for path in paths:
+        scheme = _SCHEME.match(str(path))
+        if scheme is not None and not path.exists():
+            raise ArgumentError(
+                f"a url ({scheme[0]}/…) stands where only files of this machine are read; "
+                "copy it here and name the copy"
+            )
 
 
 def numbers_by_name(flag: str, form: str, items: tuple[str, ...]) -> dict[str, float]:

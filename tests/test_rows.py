@@ -1,11 +1,12 @@
-"""Row arithmetic: float16 as numpy rounds it."""
+"""Row arithmetic: float16 as numpy rounds it, colours apart and together."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from weather_aug import _rows
-from weather_aug._rows import halves
+from weather_aug._rows import apart_row, halves, together_row
 
 HELD = st.floats(2.0**-14, 65504.0, width=32)
 
@@ -34,3 +35,15 @@ def test_any_shape_and_layout() -> None:
     np.testing.assert_array_equal(halves(plane[::2, ::3]), plane[::2, ::3].astype(np.float16))
     assert halves(plane).shape == (4, 6)
     assert _rows.halves(np.empty((0, 3), np.float32)).shape == (0, 3)
+
+
+@pytest.mark.parametrize("width", [1, 15, 16, 101])
+def test_colours_apart_and_together_again(width: int) -> None:
+    pixels = np.random.default_rng(width).integers(0, 256, (width, 3), dtype=np.uint8)
+    rows = np.full((3, width + 9), 7, np.uint8)
+    apart_row(pixels, *rows)
+    np.testing.assert_array_equal(pixels.T, rows[:, :width])
+    assert (rows[:, width:] == 7).all()
+    out = np.zeros_like(pixels)
+    together_row(*rows, out)
+    np.testing.assert_array_equal(pixels, out)

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from weather_aug.errors import DataError, IntegrityError
 from weather_aug.render.compose import warm_up
 from weather_aug.writers import layout
-from weather_aug.writers.journal import committed_items
+from weather_aug.writers.journal import committed_items, job_of
 from weather_aug.writers.plan import ExportPlan
 from weather_aug.writers.sample import rendered
 from weather_aug.writers.shards import WHOLE, Shard, shard_journals
@@ -104,8 +106,8 @@ def _cost(plan: ExportPlan, item: int) -> tuple[int, float]:
 def committed(state: Path, plan: ExportPlan, shard: Shard = WHOLE) -> int:
     """How many samples an export holds so far, as its journals or its `export.json` say.
 
-    Files are not looked at: some may turn out damaged. What cannot be read counts as nothing;
-    `export` says why.
+    Files are not looked at: some may turn out damaged. What cannot be read, or is of another job,
+    counts as nothing; `export` says why.
 
     Args:
         state: Folder of the export, or the state of one at a url.
@@ -114,14 +116,19 @@ def committed(state: Path, plan: ExportPlan, shard: Shard = WHOLE) -> int:
     """
     try:
         if (state / layout.CONTENTS).exists():
-            whole = layout.read_contents(state)["samples"] == plan.count
-            return shard.count(plan) if whole else 0
+            ours = _is_ours(layout.read_contents(state)["job"], plan)
+            return shard.count(plan) if ours else 0
         items = np.zeros(plan.count, bool)
         for journal in (state / layout.JOURNAL, *shard_journals(state)):
-            if journal.exists():
+            if journal.exists() and _is_ours(job_of(journal), plan):
                 for item in committed_items(journal):
                     if item < plan.count and shard.has(plan, item):
                         items[item] = True
         return int(items.sum())
     except (DataError, IntegrityError, OSError, KeyError):
         return 0
+
+
+def _is_ours(job: Any, plan: ExportPlan) -> bool:
+    """Whether a job that was read back is the plan's."""
+    return json.dumps(job) == json.dumps(plan.job)

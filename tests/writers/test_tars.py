@@ -26,6 +26,7 @@ from weather_aug.writers import engines, target, verify
 from weather_aug.writers.export import export
 from weather_aug.writers.plan import ExportPlan, plan_export
 from weather_aug.writers.sample import encoded_parts, render_recipe, write_unit
+from weather_aug.writers.source import Source
 from weather_aug.writers.tars import Tar
 from weather_aug.writers.verify import verify_export
 
@@ -180,13 +181,18 @@ def test_each_tar_is_hashed_once(
     plan: ExportPlan, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hashed: list[str] = []
-    real = _files.sha256_of_file
+    real, real_of_source = _files.sha256_of_file, verify.sha256_of
 
     def counting(path: Path) -> str:
         hashed.append(path.name)
         return real(path)
 
+    def counting_of_source(source: Source, relative: str) -> str:
+        hashed.append(Path(relative).name)
+        return real_of_source(source, relative)
+
     monkeypatch.setattr(_files, "sha256_of_file", counting)
+    monkeypatch.setattr(verify, "sha256_of", counting_of_source)
     once = [Path(path).name for path in TARS]
     assert verify_export(out) == []
     assert [name for name in hashed if name.endswith(".tar")] == once

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from refused_command import refused
 from tiny_clip import digests_of
 
 from weather_aug.cli import main
@@ -30,15 +31,6 @@ def job_of(out: Path) -> dict[str, object]:
 
 def entries_of(out: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]
-
-
-def refused(arguments: list[str], capsys: Captured) -> tuple[int, str]:
-    """Exit code and the one line on stderr of a command that must fail."""
-    with pytest.raises(SystemExit) as caught:
-        main(arguments)
-    (line,) = capsys.readouterr().err.splitlines()
-    assert isinstance(caught.value.code, int)
-    return caught.value.code, line
 
 
 def test_summary_result_classes_and_sheet(

@@ -11,6 +11,7 @@ import cv2
 import fsspec
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
+from refused_command import refused
 from tiny_clip import digests_of
 
 from weather_aug.cli import main
@@ -43,15 +44,6 @@ def store(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[MemoryFil
     fsspec.register_implementation("memory", Strict, clobber=True)
     yield Strict()
     fsspec.register_implementation("memory", MemoryFileSystem, clobber=True)
-
-
-def refused(arguments: list[str], capsys: Captured) -> tuple[int, str]:
-    """Exit code and the one line on stderr of a command that must fail."""
-    with pytest.raises(SystemExit) as caught:
-        main(arguments)
-    (line,) = capsys.readouterr().err.splitlines()
-    assert isinstance(caught.value.code, int)
-    return caught.value.code, line
 
 
 def test_shards_and_the_command_that_finishes(
